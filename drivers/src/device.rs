@@ -1,0 +1,133 @@
+//! The contract of a driver: find, configure and open are three acts; an open instrument is a profiler or a probe.
+
+use std::fmt;
+use std::time::{Duration, Instant};
+
+use crate::capture::{Profile, Touch};
+
+/// One family of instruments, before any of them is opened.
+pub struct Driver {
+    /// The word after `driver =` in a cell's configuration; equals the file name, with `-` for `_`.
+    pub name: &'static str,
+    /// What it is, for people.
+    pub summary: &'static str,
+    /// Checks one `[[device]]` table without its `name` and `driver`. No effects; all mistakes at once.
+    pub configure: fn(toml::Table) -> Result<Box<dyn Setup>, Vec<Mistake>>,
+}
+
+/// Something wrong in a configuration table.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{key}: {found}, expected {expected}")]
+pub struct Mistake {
+    /// The key, or the keys joined by dots.
+    pub key: String,
+    /// What was seen.
+    pub found: String,
+    /// What is allowed.
+    pub expected: String,
+}
+
+/// A thing that one device must have for itself, so that clashes show before anything opens.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Claim {
+    /// A serial port, by path or by the serial number of its USB converter.
+    Port(String),
+    /// A TCP address.
+    Address(String),
+}
+
+impl fmt::Display for Claim {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Claim::Port(port) => write!(f, "port {port}"),
+            Claim::Address(address) => write!(f, "address {address}"),
+        }
+    }
+}
+
+/// A checked device configuration, ready to open.
+pub trait Setup: Send + Sync + fmt::Debug {
+    /// What the device must have for itself.
+    fn claims(&self) -> Vec<Claim>;
+    /// Opens the link, checks the identity, leaves the laser off and the stream stopped.
+    ///
+    /// # Errors
+    /// Whatever keeps the device from answering as the one that was configured.
+    fn open(&self, links: &dyn crate::link::Links)
+    -> Result<Instrument, crate::error::DeviceError>;
+}
+
+/// An open instrument. Dropping it stops the stream and switches the laser off.
+pub enum Instrument {
+    /// Streams profiles.
+    Profiler(Box<dyn Profiler>),
+    /// Touches where it is told.
+    Probe(Box<dyn Probe>),
+}
+
+/// Who an instrument says it is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Identity {
+    /// Maker, as read from the device.
+    pub vendor: String,
+    /// Model, as read.
+    pub model: String,
+    /// Serial number, as read; empty where the device has none.
+    pub serial: String,
+    /// Firmware, as read.
+    pub firmware: String,
+}
+
+/// What was lost on the way, since the run started. Nothing is lost silently.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Losses {
+    /// Profiles received whole.
+    pub received: u64,
+    /// Profiles missing by sequence number: lost on the link.
+    pub lost_on_link: u64,
+    /// Profiles the device dropped by its own count.
+    pub dropped_by_device: u64,
+    /// Frames or lines thrown away because a check failed.
+    pub rejected: u64,
+    /// Bytes thrown away in search of the next frame.
+    pub skipped_bytes: u64,
+}
+
+/// An open line-laser profiler.
+pub trait Profiler: Send {
+    /// Who it says it is.
+    fn identity(&self) -> &Identity;
+    /// Starts a run: laser on, sequence from 0.
+    ///
+    /// # Errors
+    /// When the device refuses or does not answer; the laser is then off.
+    fn start(&mut self) -> Result<(), crate::error::DeviceError>;
+    /// Waits for the next profile until `deadline`; `None` when it passed, or when the run ended by itself.
+    ///
+    /// # Errors
+    /// When the device is gone; reopening is the caller's decision.
+    fn next(&mut self, deadline: Instant) -> Result<Option<Profile>, crate::error::DeviceError>;
+    /// Ends the run: laser off. Profiles still under way are returned, so that nothing sent is lost.
+    ///
+    /// # Errors
+    /// When the device does not confirm; it then stops by its own keep-alive.
+    fn stop(&mut self) -> Result<Vec<Profile>, crate::error::DeviceError>;
+    /// What was lost since [`Profiler::start`].
+    fn losses(&self) -> Losses;
+}
+
+/// An open touch probe on a controller that moves it.
+pub trait Probe: Send {
+    /// Who it says it is.
+    fn identity(&self) -> &Identity;
+    /// Moves to `start_mm` without touching, then towards `target_mm` until contact. Machine axes, mm.
+    ///
+    /// # Errors
+    /// No contact before `target_mm`, an alarm, or a device that is gone; the error says what to do.
+    fn touch(
+        &mut self,
+        start_mm: [f64; 3],
+        target_mm: [f64; 3],
+        timeout: Duration,
+    ) -> Result<Touch, crate::error::DeviceError>;
+}

@@ -1,0 +1,14 @@
+//! Line-laser profilers and touch probes: bytes to captures. A driver knows no geometry.
+//!
+//! In reading order: [`capture`] (what instruments deliver), [`device`] (the driver contract), [`link`] (bytes to and from a
+//! device, recorded and replayed), then one file a driver. To add one: write `<model>.rs`, add a line to [`ALL`].
+
+#![forbid(unsafe_code)]
+
+pub mod capture;
+pub mod device;
+pub mod error;
+pub mod link;
+
+/// Every driver, in the order shown to people.
+pub static ALL: &[device::Driver] = &[];

@@ -1,0 +1,5 @@
+//! Rigid transforms, fits with residuals and covariance, NURBS curves and surfaces.
+
+pub mod rigid;
+
+pub use rigid::RigidTransform;

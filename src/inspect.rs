@@ -1,0 +1,3 @@
+//! Alignment of a scan to the nominal, measurement of every sharp edge, uncertainty, verdict.
+
+pub mod result;

@@ -1,0 +1,10 @@
+//! Acies finds the sharp edges of a scanned part and measures each against its nominal NURBS edge.
+//!
+//! The modules stand in order of dependency: each uses only those above it, and `tests/house.rs` holds them to that.
+
+#![forbid(unsafe_code)]
+
+pub mod geometry;
+pub mod inspect;
+pub mod nominal;
+pub mod points;

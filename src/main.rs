@@ -1,0 +1,2 @@
+//! The `acies` program.
+fn main() {}
