@@ -5,6 +5,11 @@
 #![forbid(unsafe_code)]
 
 pub mod geometry;
+
 pub mod inspect;
+
 pub mod nominal;
+
 pub mod points;
+
+pub mod cli;
