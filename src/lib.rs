@@ -4,12 +4,14 @@
 
 #![forbid(unsafe_code)]
 
-pub mod geometry;
+pub mod points;
 
-pub mod inspect;
+pub mod geometry;
 
 pub mod nominal;
 
-pub mod points;
+pub mod inspect;
+
+pub mod acquire;
 
 pub mod cli;
