@@ -14,4 +14,6 @@ pub mod inspect;
 
 pub mod acquire;
 
+pub mod config;
+
 pub mod cli;
