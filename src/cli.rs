@@ -1,6 +1,31 @@
 //! The command line: one file a subcommand. Argument parsing only; the work is done by the modules above.
 
+mod check;
+mod devices;
+
 use std::process::ExitCode;
+
+/// What `acies` can be asked to do.
+#[derive(Debug, clap::Subcommand)]
+pub enum Command {
+    /// Say everything that is wrong with a cell's configuration, touching no device.
+    Check(check::Check),
+    /// List what is attached, who may open it, and why not.
+    Devices(devices::Devices),
+}
+
+impl Command {
+    /// Carries the command out.
+    ///
+    /// # Errors
+    /// [`Failure`], whose variant is the exit status.
+    pub fn run(self) -> Result<Status, Failure> {
+        match self {
+            Command::Check(command) => command.run(),
+            Command::Devices(command) => command.run(),
+        }
+    }
+}
 
 /// How a command that was carried out ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -48,6 +73,17 @@ impl Failure {
             Failure::BadInput(_) => 65,
             Failure::Internal(_) => 70,
             Failure::Io(_) => 74,
+        }
+    }
+}
+
+/// Prints one line on standard output; a closed pipe ends the program quietly, as other tools do.
+pub(crate) fn print_line(text: &str) -> Result<(), Failure> {
+    use std::io::Write;
+    match writeln!(std::io::stdout().lock(), "{text}") {
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => std::process::exit(0),
+        other => {
+            other.map_err(|error| Failure::Io(anyhow::Error::new(error).context("standard output")))
         }
     }
 }
