@@ -4,7 +4,9 @@ use std::process::ExitCode;
 
 use acies::cli::{Command, Failure};
 use clap::Parser;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 /// Finds the sharp edges of a scanned part and measures each against its nominal NURBS edge.
 ///
