@@ -12,4 +12,6 @@ pub mod nominal;
 
 pub mod points;
 
+pub mod report;
+
 pub mod cli;
