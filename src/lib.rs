@@ -16,4 +16,6 @@ pub mod acquire;
 
 pub mod config;
 
+pub mod report;
+
 pub mod cli;
