@@ -4,7 +4,18 @@
 
 #![forbid(unsafe_code)]
 
-pub mod geometry;
-pub mod inspect;
-pub mod nominal;
 pub mod points;
+
+pub mod geometry;
+
+pub mod nominal;
+
+pub mod inspect;
+
+pub mod acquire;
+
+pub mod config;
+
+pub mod report;
+
+pub mod cli;
