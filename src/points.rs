@@ -4,6 +4,13 @@
 
 use glam::DVec3;
 
+pub(crate) mod moments;
+pub mod neighbors;
+pub mod spacing;
+
+pub use neighbors::Neighbors;
+pub use spacing::{Spacing, noise_mm, spacing};
+
 /// The frame that coordinates are given in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Frame {
