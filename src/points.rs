@@ -7,6 +7,7 @@ pub mod error;
 mod lzf;
 mod obj;
 mod pcd;
+pub mod picture;
 mod ply;
 pub mod read;
 mod scalar;
