@@ -156,6 +156,12 @@ pub enum DecodeError {
         /// The message's name in the manual.
         message: &'static str,
     },
+    /// A reply of another kind than the command's.
+    #[error("{command} was answered by a message of another kind")]
+    WrongReply {
+        /// The command's name in the manual.
+        command: &'static str,
+    },
     /// A line that follows no form of the manual.
     #[error("the line {line:?} is none the controller may send")]
     Line {

@@ -11,6 +11,8 @@ pub mod capture;
 pub mod device;
 pub mod error;
 pub mod link;
+pub mod open_profile;
+mod settings;
 
 /// Every driver, in the order shown to people.
-pub static ALL: &[device::Driver] = &[];
+pub static ALL: &[device::Driver] = &[open_profile::DRIVER];
