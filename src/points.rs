@@ -9,6 +9,7 @@ pub(crate) mod moments;
 pub mod neighbors;
 mod obj;
 mod pcd;
+pub mod picture;
 mod ply;
 pub mod read;
 mod scalar;
