@@ -14,10 +14,10 @@ pub mod nominal;
 
 pub mod inspect;
 
+pub mod report;
+
 pub mod acquire;
 
 pub mod config;
-
-pub mod report;
 
 pub mod cli;
