@@ -8,6 +8,7 @@ mod build;
 mod characteristic;
 mod conclusion;
 mod figure;
+mod html;
 pub mod wire;
 
 use std::collections::BTreeMap;
@@ -15,6 +16,7 @@ use std::time::SystemTime;
 
 use acies_drivers::device::{Identity, Losses};
 
+pub use html::content_security_policy;
 pub use wire::Report;
 
 /// What a report says beside what the inspection found.
