@@ -33,7 +33,10 @@ pub type FlankPoint = (f64, f64, f64, u32);
 impl FlankPoints {
     /// Sorts the points along the edge.
     pub fn new(mut points: Vec<FlankPoint>) -> Self {
-        points.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        points.sort_by(|a, b| {
+            let by_place = a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1));
+            by_place.then(a.2.total_cmp(&b.2)).then(a.3.cmp(&b.3))
+        });
         let mut flank = Self::default();
         for (s, r, deviation, line) in points {
             flank.s.push(s);
@@ -122,6 +125,9 @@ pub struct FlankSeries {
     pub reach_mm: f64,
     /// Whether the model needed a term in r squared.
     pub bent: bool,
+    /// Variance of the mean offset over the stations, over what it would be if stations shared nothing. They share scan
+    /// lines that run along the edge, and form deviation.
+    pub shared_factor: f64,
 }
 
 /// Measures one flank at every station of its edge.
@@ -315,6 +321,7 @@ fn finish<const P: usize, const Q: usize>(
 ) -> FlankSeries {
     let noise = variance::estimate(&series);
     let form = variance::form_factors(&series, richer, &noise);
+    let shared_factor = variance::shared_factor(&series, &noise, &form);
     let stations = series
         .into_iter()
         .zip(noise.iter().zip(form))
@@ -336,6 +343,7 @@ fn finish<const P: usize, const Q: usize>(
         stations,
         reach_mm: settings.reach_mm,
         bent,
+        shared_factor,
     }
 }
 

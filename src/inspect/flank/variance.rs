@@ -16,8 +16,10 @@ const SIGNIFICANT: f64 = 3.0;
 const PRIOR_FREEDOM: f64 = 30.0;
 
 /// Moments of the residuals of one fit, grouped.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone)]
 pub(super) struct Clusters<const P: usize> {
+    /// The groups with the influence of each on the offset: what a common shift of its points moves.
+    influence: Vec<(u32, f64)>,
     /// Sum over the groups of (sum of residuals)^2 / n.
     between: f64,
     /// Sum of squared residuals.
@@ -49,13 +51,23 @@ impl<const P: usize> Clusters<P> {
             n += 1.0;
         }
         groups.remove(&NO_LINE);
+        let mut unit = [0.0; P];
+        unit[0] = 1.0;
+        let influence = groups
+            .iter()
+            .map(|(id, (_, sum, _))| (*id, product(&unit, &fit.cofactor, sum)))
+            .collect();
         let groups: Vec<(f64, [f64; P], f64)> = groups.into_values().collect();
-        Self::from_sums(&groups, (n, total), fit)
+        Self {
+            influence,
+            ..Self::from_sums(&groups, (n, total), fit)
+        }
     }
 
     fn from_sums(groups: &[(f64, [f64; P], f64)], all: (f64, f64), fit: &LinearFit<P>) -> Self {
         let (n, total) = all;
         let mut clusters = Self {
+            influence: Vec::new(),
             between: 0.0,
             total,
             between_of: [0.0; 2],
@@ -168,7 +180,7 @@ pub(super) fn pooled<'a, const P: usize>(windows: impl Iterator<Item = &'a Windo
     for window in windows {
         match &mut cells {
             Some(sum) => sum.merge(&window.cells),
-            None => cells = Some(window.cells),
+            None => cells = Some(window.cells.clone()),
         }
         let own = (window.fit.used - P) as f64;
         square += own * window.sigma.powi(2);
@@ -191,7 +203,7 @@ pub(super) fn estimate<const P: usize>(series: &Series<P>) -> Vec<Noise> {
     for window in series.iter().flatten() {
         match &mut lines {
             Some(sum) => sum.merge(&window.lines),
-            None => lines = Some(window.lines),
+            None => lines = Some(window.lines.clone()),
         }
     }
     let line = lines.and_then(|l| l.components()).map_or(0.0, |c| c.1);
@@ -273,4 +285,37 @@ fn form_variance<'a>(differences: impl Iterator<Item = &'a (f64, f64, f64)>) -> 
         count + 2.0 * SIGNIFICANT * (2.0f64 * count).sqrt()
     };
     if chi > limit { excess / count } else { 0.0 }
+}
+
+/// Stations over which form deviation is taken to be one and the same: those that it is judged over.
+const FORM_LENGTH: f64 = 5.0;
+
+/// Variance of the mean offset over the stations, over what it would be if they shared nothing.
+pub(super) fn shared_factor<const P: usize>(
+    series: &Series<P>,
+    noise: &[Noise],
+    form: &[f64],
+) -> f64 {
+    let (mut alone, mut shared) = (0.0, 0.0);
+    let mut lines: BTreeMap<u32, f64> = BTreeMap::new();
+    for ((window, noise), form) in series.iter().zip(noise).zip(form) {
+        let Ok(window) = window else { continue };
+        let total = noise.full(window)[0][0];
+        let white = noise.white * window.fit.cofactor[0][0];
+        let own_lines: f64 = window.lines.influence.iter().map(|(_, w)| w * w).sum();
+        // Lines and cells overlap; what is no line is form.
+        let local = (total - white - noise.line * own_lines).max(0.0) + total * (form - 1.0);
+        alone += total * form;
+        shared += white + FORM_LENGTH * local;
+        for (line, weight) in &window.lines.influence {
+            *lines.entry(*line).or_insert(0.0) += weight;
+        }
+    }
+    let line: f64 = noise.iter().map(|n| n.line).fold(0.0, f64::max);
+    shared += line * lines.values().map(|w| w * w).sum::<f64>();
+    if alone > 0.0 {
+        (shared / alone).max(1.0)
+    } else {
+        1.0
+    }
 }
