@@ -4,7 +4,20 @@
 
 #![forbid(unsafe_code)]
 
-pub mod geometry;
-pub mod inspect;
-pub mod nominal;
 pub mod points;
+
+pub mod geometry;
+
+pub mod features;
+
+pub mod nominal;
+
+pub mod inspect;
+
+pub mod report;
+
+pub mod acquire;
+
+pub mod config;
+
+pub mod cli;

@@ -1,0 +1,89 @@
+//! The command line: one file a subcommand. Argument parsing only; the work is done by the modules above.
+
+mod check;
+mod devices;
+
+use std::process::ExitCode;
+
+/// What `acies` can be asked to do.
+#[derive(Debug, clap::Subcommand)]
+pub enum Command {
+    /// Say everything that is wrong with a cell's configuration, touching no device.
+    Check(check::Check),
+    /// List what is attached, who may open it, and why not.
+    Devices(devices::Devices),
+}
+
+impl Command {
+    /// Carries the command out.
+    ///
+    /// # Errors
+    /// [`Failure`], whose variant is the exit status.
+    pub fn run(self) -> Result<Status, Failure> {
+        match self {
+            Command::Check(command) => command.run(),
+            Command::Devices(command) => command.run(),
+        }
+    }
+}
+
+/// How a command that was carried out ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Status {
+    /// Done, and OK where there is a verdict.
+    Done,
+    /// Done, and the part is not OK.
+    NotOk,
+    /// Done, and the data do not allow a verdict.
+    NotDecidable,
+}
+
+/// Why a command could not be carried out. The variant decides the exit status.
+#[derive(Debug, thiserror::Error)]
+pub enum Failure {
+    /// Wrong usage: arguments that make no sense together.
+    #[error(transparent)]
+    Usage(anyhow::Error),
+    /// Bad input: a file or configuration that cannot be understood.
+    #[error(transparent)]
+    BadInput(anyhow::Error),
+    /// Our fault.
+    #[error(transparent)]
+    Internal(anyhow::Error),
+    /// Reading, writing or a device failed.
+    #[error(transparent)]
+    Io(anyhow::Error),
+}
+
+impl From<Status> for ExitCode {
+    fn from(status: Status) -> Self {
+        ExitCode::from(match status {
+            Status::Done => 0,
+            Status::NotOk => 1,
+            Status::NotDecidable => 2,
+        })
+    }
+}
+
+impl Failure {
+    /// The exit status: 64 wrong usage, 65 bad input, 70 our fault, 74 input or output failed.
+    pub fn exit_status(&self) -> u8 {
+        match self {
+            Failure::Usage(_) => 64,
+            Failure::BadInput(_) => 65,
+            Failure::Internal(_) => 70,
+            Failure::Io(_) => 74,
+        }
+    }
+}
+
+/// Prints one line on standard output; a closed pipe ends the program quietly, as other tools do.
+pub(crate) fn print_line(text: &str) -> Result<(), Failure> {
+    use std::io::Write;
+    match writeln!(std::io::stdout().lock(), "{text}") {
+        Err(error) if error.kind() == std::io::ErrorKind::BrokenPipe => std::process::exit(0),
+        other => {
+            other.map_err(|error| Failure::Io(anyhow::Error::new(error).context("standard output")))
+        }
+    }
+}
