@@ -66,9 +66,7 @@ fn read(text: &str) -> Option<Line<'_>> {
         return Some(Line::Status(inner));
     }
     if let Some(setting) = text.strip_prefix('$') {
-        let Some((number, value)) = setting.split_once('=') else {
-            return None;
-        };
+        let (number, value) = setting.split_once('=')?;
         return match whole(number) {
             Some(number) => Some(Line::Setting(number, value)),
             None => number.starts_with('N').then_some(Line::Note(text)),
