@@ -89,7 +89,10 @@ impl Bounds {
                 continue;
             }
             let inverse = 1.0 / d;
-            let (a, b) = ((self.low[axis] - o) * inverse, (self.high[axis] - o) * inverse);
+            let (a, b) = (
+                (self.low[axis] - o) * inverse,
+                (self.high[axis] - o) * inverse,
+            );
             from = from.max(a.min(b));
             to = to.min(a.max(b));
         }

@@ -63,7 +63,10 @@ impl Surfaces {
 
     /// All of them with their numbers.
     pub fn iter(&self) -> impl Iterator<Item = (SurfaceId, &Surface)> {
-        self.0.iter().enumerate().map(|(i, s)| (SurfaceId(i as u32), s))
+        self.0
+            .iter()
+            .enumerate()
+            .map(|(i, s)| (SurfaceId(i as u32), s))
     }
 
     /// A box between two corners, with the numbers of its sides: -x, +x, -y, +y, -z, +z.
@@ -92,7 +95,12 @@ impl Surfaces {
         radius: f64,
     ) -> (Solid, [SurfaceId; 3]) {
         let ids = [
-            self.add(Surface::cylinder(&format!("{name} side"), base, axis, radius)),
+            self.add(Surface::cylinder(
+                &format!("{name} side"),
+                base,
+                axis,
+                radius,
+            )),
             self.add(Surface::plane(&format!("{name} base"), base, -axis)),
             self.add(Surface::plane(&format!("{name} top"), base + axis, axis)),
         ];
@@ -109,7 +117,12 @@ impl Surfaces {
         half_angle_rad: f64,
     ) -> (Solid, [SurfaceId; 2]) {
         let ids = [
-            self.add(Surface::cone(&format!("{name} side"), apex, axis, half_angle_rad)),
+            self.add(Surface::cone(
+                &format!("{name} side"),
+                apex,
+                axis,
+                half_angle_rad,
+            )),
             self.add(Surface::plane(&format!("{name} base"), apex + axis, axis)),
         ];
         let radius = axis.length() * half_angle_rad.tan();
@@ -148,7 +161,11 @@ impl Surfaces {
                 DVec3::Z * z[0],
                 DVec3::NEG_Z,
             )),
-            self.add(Surface::plane(&format!("{name} top"), DVec3::Z * z[1], DVec3::Z)),
+            self.add(Surface::plane(
+                &format!("{name} top"),
+                DVec3::Z * z[1],
+                DVec3::Z,
+            )),
         ];
         let mut bounds = Bounds::EMPTY;
         for (i, &a) in polygon.iter().enumerate() {
@@ -235,9 +252,7 @@ impl Solid {
     /// Inside all of them.
     pub fn all(solids: impl IntoIterator<Item = Solid>) -> Solid {
         let solids: Vec<Solid> = solids.into_iter().collect();
-        let bounds = solids
-            .iter()
-            .fold(Bounds::ALL, |b, s| b.common(&s.bounds));
+        let bounds = solids.iter().fold(Bounds::ALL, |b, s| b.common(&s.bounds));
         Solid {
             bounds,
             node: Node::All(solids),

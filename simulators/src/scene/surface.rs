@@ -25,14 +25,36 @@ pub struct Surface {
 #[derive(Debug, Clone)]
 pub(super) enum Shape {
     /// Held in the scene's frame, since it is by far the most frequent.
-    Plane { normal: DVec3, offset: f64 },
-    Cylinder { pose: Pose, radius: f64 },
+    Plane {
+        normal: DVec3,
+        offset: f64,
+    },
+    Cylinder {
+        pose: Pose,
+        radius: f64,
+    },
     /// Apex at the origin, opening towards +z.
-    Cone { pose: Pose, half_angle: f64 },
-    Sphere { pose: Pose, radius: f64 },
-    Torus { pose: Pose, major: f64, minor: f64 },
-    HeightField { pose: Pose, field: HeightField },
-    Facets { pose: Pose, facets: Arc<Facets> },
+    Cone {
+        pose: Pose,
+        half_angle: f64,
+    },
+    Sphere {
+        pose: Pose,
+        radius: f64,
+    },
+    Torus {
+        pose: Pose,
+        major: f64,
+        minor: f64,
+    },
+    HeightField {
+        pose: Pose,
+        field: HeightField,
+    },
+    Facets {
+        pose: Pose,
+        facets: Arc<Facets>,
+    },
 }
 
 /// z as a bicubic Bezier function of x and y over a rectangle.
@@ -266,10 +288,7 @@ fn local(pose: &Pose, point: DVec3) -> DVec3 {
 
 fn local_ray(pose: &Pose, ray: &Ray) -> (DVec3, DVec3) {
     let back = pose.rotation.transpose();
-    (
-        back * (ray.origin - pose.translation),
-        back * ray.direction,
-    )
+    (back * (ray.origin - pose.translation), back * ray.direction)
 }
 
 fn plane_spans(id: SurfaceId, plane: (DVec3, f64), ray: &Ray, window: Window) -> Spans {
