@@ -370,7 +370,7 @@ fn scan(profiler: &mut dyn Profiler, n: usize) -> Result<Vec<Profile>, DeviceErr
 /// Scans over a bad line and holds every count to the simulator's log.
 fn losses_are_exact(faults: &str, test: &str) {
     let (device, mut profiler) = simulated_profiler(faults, test);
-    let profiles = scan(profiler.as_mut(), 200).expect("a scan");
+    let profiles = scan(profiler.as_mut(), 150).expect("a scan");
     let losses = profiler.losses();
     let status = device.status();
     let truth = device.truth();
@@ -433,7 +433,7 @@ fn losses_under_every_fault_of_framing_are_exact() {
 
 #[test]
 fn losses_of_device_and_link_are_told_apart() {
-    losses_are_exact("drop=0.1,lose-frame=0.1,lumps", "apart");
+    losses_are_exact("drop=0.05,lose-frame=0.05,lumps", "apart");
 }
 
 #[test]

@@ -38,8 +38,10 @@ struct Model {
     dropped: u32,
     /// Profiles that come between STOP and STOPPED.
     queued: u32,
-    /// Answers STOP with HELLO's reply and so on: REFUSED for this type.
+    /// Answers this type by REFUSED.
     refuses: Option<u8>,
+    /// Answers HELLO by STOPPED.
+    confused: bool,
 }
 
 fn frame(kind: u8, id: u32, payload: &[u8]) -> Vec<u8> {
@@ -137,6 +139,7 @@ impl Device for Model {
             return frame(0x9F, id, b"\x08\x00\x04\x00oops");
         }
         match kind {
+            1 if self.confused => stopped(id, 0, 0, 0, 0),
             1 => frame(0x81, id, &self.identity()),
             2 => {
                 let asked = i64::from_le_bytes(payload[2..10].try_into().expect("8 bytes"));
@@ -309,6 +312,18 @@ fn a_refused_command_says_why() {
     assert_eq!(
         refused(model, TABLE),
         "/dev/fake: HELLO is refused: hardware fault, \"oops\"; switch the device off and on; if it comes back, have it repaired"
+    );
+}
+
+#[test]
+fn an_answer_to_another_question_is_told() {
+    let model = Model {
+        confused: true,
+        ..Model::default()
+    };
+    assert_eq!(
+        refused(model, TABLE),
+        "/dev/fake: bad data from the device: HELLO was answered by a message of another kind"
     );
 }
 
