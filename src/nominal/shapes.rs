@@ -302,12 +302,6 @@ impl Shapes<'_> {
                 radius_mm: self.length(&r, 2)?,
             },
             "TOROIDAL_SURFACE" | "DEGENERATE_TOROIDAL_SURFACE" => {
-                if r.name.starts_with('D') && !r.flag(4)? {
-                    return Err(refuse(
-                        id,
-                        "the inner part of a degenerate torus is not read",
-                    ));
-                }
                 Surface::Torus {
                     frame: frame()?,
                     major_mm: self.length(&r, 2)?,
