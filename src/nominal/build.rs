@@ -17,7 +17,7 @@ use crate::geometry::{Curve, Frame, RigidTransform, Surface};
 /// Faces that one nominal may have.
 const MAX_FACES: usize = 200_000;
 /// Chord of the polylines that bound a face, as a share of the edge's length.
-const CHORD: f64 = 2e-5;
+const CHORD: f64 = 8e-6;
 
 /// Reads a nominal from the text of a STEP file.
 pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
