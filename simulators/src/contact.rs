@@ -179,7 +179,10 @@ mod tests {
         assert!((straight - 5.5).abs() < 1e-12, "{straight}");
         // slanted by 3:4, the centre still stops at z = 6.5
         let slanted = travel([3.0, 9.0, 10.5], [6.0, 9.0, 6.0]).unwrap();
-        assert!((slanted - 4.0 * 5.408_326_913_195_984 / 4.5).abs() < 1e-12, "{slanted}");
+        assert!(
+            (slanted - 4.0 * 5.408_326_913_195_984 / 4.5).abs() < 1e-12,
+            "{slanted}"
+        );
     }
 
     #[test]
