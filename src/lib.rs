@@ -12,10 +12,12 @@ pub mod nominal;
 
 pub mod inspect;
 
+pub mod report;
+
 pub mod acquire;
 
 pub mod config;
 
-pub mod report;
+pub mod web;
 
 pub mod cli;

@@ -4,6 +4,8 @@
 mod part;
 #[path = "report/schema.rs"]
 mod schema;
+#[path = "report/web.rs"]
+mod web;
 
 use acies::report::Report;
 
