@@ -1,5 +1,7 @@
 //! The report and its forms, read as their readers read them.
 
+#[path = "report/forms.rs"]
+mod forms;
 #[path = "report/part.rs"]
 mod part;
 #[path = "report/schema.rs"]

@@ -71,7 +71,7 @@ fn row(edge: &Edge, station: &Station, part: Status) -> [String; HEADER.len()] {
         None => Default::default(),
     };
     let length = |value: Option<f64>| value.map_or_else(String::new, mm);
-    let angle = |value: Option<f64>| value.map_or_else(String::new, |v| format!("{v:.5}"));
+    let angle = |value: Option<f64>| value.map_or_else(String::new, |v| fixed(v, 5));
     let kind = match edge.kind {
         Kind::Convex => "convex",
         Kind::Concave => "concave",
@@ -116,11 +116,20 @@ fn row(edge: &Edge, station: &Station, part: Status) -> [String; HEADER.len()] {
 
 /// To 0.01 µm: finer than any instrument that comes near us.
 fn mm(value: f64) -> String {
-    format!("{value:.5}")
+    fixed(value, 5)
 }
 
 fn direction(value: f64) -> String {
-    format!("{value:.7}")
+    fixed(value, 7)
+}
+
+/// Without the sign of what rounds to zero.
+fn fixed(value: f64, decimals: usize) -> String {
+    let text = format!("{value:.decimals$}");
+    match text.strip_prefix('-') {
+        Some(zero) if zero.bytes().all(|b| b == b'0' || b == b'.') => zero.to_owned(),
+        _ => text,
+    }
 }
 
 fn word(status: Status) -> String {

@@ -167,7 +167,7 @@ fn before_the_first_report_the_page_says_so_and_afterwards_shows_the_newest() {
 #[test]
 fn what_is_not_there_and_what_is_not_allowed_is_said_in_words() {
     let server = Server::start();
-    let (head, body) = server.ask("GET", "/../etc/<script>");
+    let (head, body) = server.ask("GET", "/../etc/%3Cscript%3E");
     assert!(head.starts_with("http/1.1 404"), "{head}");
     let body = String::from_utf8_lossy(&body).into_owned();
     assert!(body.contains("There is nothing at this address") && body.contains("/report.json"));
