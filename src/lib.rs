@@ -20,4 +20,6 @@ pub mod acquire;
 
 pub mod config;
 
+pub mod web;
+
 pub mod cli;
