@@ -87,7 +87,12 @@ pub fn detect(cloud: &PointCloud, neighbors: &Neighbors, method: Method) -> Dete
     detection
 }
 
-fn adaptive(cloud: &PointCloud, neighbors: &Neighbors, detection: &mut Detection, clock: &mut Clock) {
+fn adaptive(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    detection: &mut Detection,
+    clock: &mut Clock,
+) {
     let places = Places {
         positions: neighbors
             .places()

@@ -223,7 +223,9 @@ fn write_devices(out: &mut String, report: &Report) -> fmt::Result {
         )?;
         match device.losses {
             Some(losses) => write_losses(out, &losses)?,
-            None => out.write_str("<td class=\"soft\" colspan=\"5\">touches one at a time, cannot lose</td>")?,
+            None => out.write_str(
+                "<td class=\"soft\" colspan=\"5\">touches one at a time, cannot lose</td>",
+            )?,
         }
         out.write_str("</tr>\n")?;
     }
