@@ -63,18 +63,26 @@ pub(super) fn placed_bodies(
         .flatten()
         .map(|c| c.representation)
         .collect();
-    let representations = assembly.representations();
     let mut out = Vec::new();
-    for root in representations.iter().filter(|r| !contained.contains(r)) {
-        let mut trail = Vec::new();
-        if !assembly.walk(*root, RigidTransform::IDENTITY, &mut trail, &mut out) {
+    // A body that also stands in a representation of its own, outside the assembly, is no second body.
+    let roots = assembly.representations().into_iter();
+    let (assemblies, alone): (Vec<u64>, Vec<u64>) = roots
+        .filter(|r| !contained.contains(r))
+        .partition(|r| assembly.children.contains_key(r));
+    let mut seen = BTreeSet::new();
+    for root in assemblies.into_iter().chain(alone) {
+        let mut found = Vec::new();
+        let is_assembly = assembly.children.contains_key(&root);
+        if !assembly.walk(root, RigidTransform::IDENTITY, &mut Vec::new(), &mut found) {
             return Err(NominalError::TooManyFaces {
                 name: name.into(),
                 limit: MAX_PLACES,
             });
         }
+        found.retain(|p| is_assembly || !seen.contains(&p.body));
+        seen.extend(found.iter().map(|p| p.body));
+        out.extend(found);
     }
-    let seen: BTreeSet<u64> = out.iter().map(|p| p.body).collect();
     let default = assembly.any_units();
     for body in file.all(&BODIES).filter(|b| !seen.contains(b)) {
         out.push(Placed {

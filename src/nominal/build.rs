@@ -12,7 +12,7 @@ use super::shapes::Shapes;
 use super::sharp::{Joint, SharpEdge};
 use super::trim::{Trim, UvLoop};
 use super::{Edge, Nominal, NominalError, Refused};
-use crate::geometry::{Curve, RigidTransform, Surface};
+use crate::geometry::{Curve, Frame, RigidTransform, Surface};
 
 /// Faces that one nominal may have.
 const MAX_FACES: usize = 200_000;
@@ -212,11 +212,12 @@ impl<'a> Builder<'a> {
         let surface = cx.shapes.surface(r.reference(2)?)?;
         // Loops run around the face's normal, which may be against the surface's.
         let along = r.flag(3)? ^ surface.reversed;
-        let shape = surface.shape.transformed(&cx.place);
         let mut loops = Vec::new();
         for bound in r.references(1)? {
             loops.extend(self.bound(cx, bound)?);
         }
+        let shape = surface.shape.transformed(&cx.place);
+        let shape = self.used_nappe(shape, &loops);
         let uv = |flip: bool| -> Vec<UvLoop> {
             let lay = |l: &EdgeLoop| self.lay(&shape, l, flip);
             loops.iter().map(lay).filter(|l| l.len() > 1).collect()
@@ -247,6 +248,37 @@ impl<'a> Builder<'a> {
         }
         self.faces.push(face);
         Ok(())
+    }
+
+    /// A cone on the side of its apex where its edges lie: files may use the far side, where the radius runs below zero.
+    fn used_nappe(&self, surface: Surface, loops: &[EdgeLoop]) -> Surface {
+        let Surface::Cone {
+            frame,
+            radius_mm,
+            half_angle_rad,
+        } = surface
+        else {
+            return surface;
+        };
+        let apex = frame.origin - frame.z * (radius_mm / half_angle_rad.tan());
+        let points = loops
+            .iter()
+            .flatten()
+            .flat_map(|(e, _)| &self.edges[*e].points);
+        let height: f64 = points.map(|p| (*p - apex).dot(frame.z)).sum();
+        if height >= 0.0 {
+            return surface;
+        }
+        Surface::Cone {
+            frame: Frame {
+                origin: apex,
+                y: -frame.y,
+                z: -frame.z,
+                ..frame
+            },
+            radius_mm: 0.0,
+            half_angle_rad,
+        }
     }
 
     /// The edges of one bound in the order and direction in which the face has them on its left; none for a vertex.

@@ -268,15 +268,21 @@ impl Trim {
     /// Finds out whether parity alone tells inside from outside.
     fn judge(&mut self) {
         let (from, to) = self.extent;
-        let probes = (0..16).map(|i| from + (to - from) * (f64::from(i) + 0.4871) / 16.0);
-        let mut odd = 0;
-        let mut any = 0;
-        for a in probes.filter(|a| a.is_finite()) {
-            let n = self.crossings(a).len();
-            odd += n % 2;
-            any += n.min(1);
-        }
-        self.whole = any == 0;
+        // Segments that only rounding keeps from running along the rays bound nothing.
+        let wide = |s: &&Segment| (s.to.0 - s.from.0).abs() > 1e-9 * (to - from);
+        let wide: Vec<f64> = self
+            .segments
+            .iter()
+            .filter(wide)
+            .map(|s| s.from.0 + 0.4871 * (s.to.0 - s.from.0))
+            .collect();
+        let every = wide.len().div_ceil(64).max(1);
+        let odd = wide
+            .iter()
+            .step_by(every)
+            .filter(|a| self.crossings(**a).len() % 2 == 1)
+            .count();
+        self.whole = wide.is_empty();
         self.oriented = odd > 0 || self.ranges[1].closed;
     }
 }
