@@ -2,6 +2,7 @@
 
 pub mod basis;
 pub mod curve;
+pub mod fit;
 pub mod frame;
 pub mod newton;
 pub mod nurbs_curve;

@@ -8,12 +8,18 @@ pub mod points;
 
 pub mod geometry;
 
+pub mod features;
+
 pub mod nominal;
 
 pub mod inspect;
 
+pub mod report;
+
 pub mod acquire;
 
 pub mod config;
+
+pub mod web;
 
 pub mod cli;
