@@ -234,8 +234,11 @@ fn misplacement(rng: &mut ChaCha8Rng) -> Pose {
     let (shift, axis) = (unit(), unit());
     let [distance, angle]: [f64; 2] = rng.random();
     let centre = DVec3::new(0.5 * PLATE_MM[0], 0.5 * PLATE_MM[1], PLATE_TOP_MM);
-    Pose::shift(shift * distance * MISPLACED_MM)
-        .after(Pose::turn_about(centre, axis, angle * MISTURNED_RAD))
+    Pose::shift(shift * distance * MISPLACED_MM).after(Pose::turn_about(
+        centre,
+        axis,
+        angle * MISTURNED_RAD,
+    ))
 }
 
 fn optics(camera_side: f64) -> Optics {
@@ -268,7 +271,12 @@ fn stand(from: DVec3) -> (Pose, u32) {
     let heights = [LOWEST_SEEN_MM, PLATE_TOP_MM, TOP.range()[1]];
     for (i, z) in heights.into_iter().enumerate() {
         let length = if i == 2 { TOP.x[1] } else { PLATE_MM[0] };
-        for (x, y) in [(0.0, 0.0), (length, 0.0), (0.0, PLATE_MM[1]), (length, PLATE_MM[1])] {
+        for (x, y) in [
+            (0.0, 0.0),
+            (length, 0.0),
+            (0.0, PLATE_MM[1]),
+            (length, PLATE_MM[1]),
+        ] {
             let seen = plane * (FIXTURE_MM + DVec3::new(x, y, z));
             low = low.min(seen);
             high = high.max(seen);
