@@ -110,7 +110,13 @@ impl Workshop {
             self.seeds.push(Plane::through(
                 self.near[..k].iter().map(|(_, i)| points[*i as usize]),
             ));
-            at = (0..n).fold(0, |best, i| if self.costs[i] > self.costs[best] { i } else { best });
+            at = (0..n).fold(0, |best, i| {
+                if self.costs[i] > self.costs[best] {
+                    i
+                } else {
+                    best
+                }
+            });
         }
     }
 
@@ -120,8 +126,11 @@ impl Workshop {
         let cap = 9.0 * variance;
         self.costs.clear();
         for seed in &self.seeds {
-            self.costs
-                .extend(self.points.iter().map(|p| seed.distance(*p).powi(2).min(cap)));
+            self.costs.extend(
+                self.points
+                    .iter()
+                    .map(|p| seed.distance(*p).powi(2).min(cap)),
+            );
         }
         let row = |s: usize| &self.costs[s * n..(s + 1) * n];
         let single = (0..self.seeds.len())
@@ -149,7 +158,11 @@ impl Workshop {
             .collect();
         while chosen.len() < MOST_PLANES {
             let gain = |s: usize| -> f64 {
-                row(s).iter().zip(&so_far).map(|(a, b)| (b - a).max(0.0)).sum()
+                row(s)
+                    .iter()
+                    .zip(&so_far)
+                    .map(|(a, b)| (b - a).max(0.0))
+                    .sum()
             };
             let (s, g) = (0..self.seeds.len())
                 .map(|s| (s, gain(s)))
@@ -196,7 +209,8 @@ impl Workshop {
         let mut fits: Vec<(u8, Fit)> = (0..count)
             .filter_map(|s| {
                 let members = self.labels.iter().filter(|l| **l == s).count();
-                (members >= 4).then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
+                (members >= 4)
+                    .then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
                     .map(|f| (s, f))
             })
             .collect();
@@ -218,7 +232,9 @@ impl Workshop {
                     }
                 }
             }
-            let Some((change, i, j, union)) = best else { break };
+            let Some((change, i, j, union)) = best else {
+                break;
+            };
             if change > 0.0 {
                 doubt = change;
                 break;
@@ -272,7 +288,10 @@ impl Workshop {
                     return false;
                 }
                 let p = self.points[i];
-                let d = [surfaces[0].distance(p).powi(2), surfaces[1].distance(p).powi(2)];
+                let d = [
+                    surfaces[0].distance(p).powi(2),
+                    surfaces[1].distance(p).powi(2),
+                ];
                 if d[0] < doubtful && d[1] < doubtful {
                     let local = !curved || p.distance_squared(e) < 2.25;
                     return local && side(p) == s;
@@ -345,7 +364,9 @@ impl Workshop {
         const NEAR: f64 = 2.1;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
-                .filter(|i| self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR)
+                .filter(|i| {
+                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
+                })
                 .count();
             near >= 2
         })
