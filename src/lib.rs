@@ -8,6 +8,8 @@ pub mod points;
 
 pub mod geometry;
 
+pub mod features;
+
 pub mod nominal;
 
 pub mod inspect;
