@@ -8,14 +8,20 @@ pub mod points;
 
 pub mod geometry;
 
+pub mod features;
+
+pub mod surface;
+
 pub mod nominal;
 
 pub mod inspect;
+
+pub mod report;
 
 pub mod acquire;
 
 pub mod config;
 
-pub mod report;
+pub mod web;
 
 pub mod cli;

@@ -5,11 +5,15 @@
 mod duplicates;
 pub mod error;
 mod lzf;
+pub(crate) mod moments;
+pub mod neighbors;
 mod obj;
 mod pcd;
+pub mod picture;
 mod ply;
 pub mod read;
 mod scalar;
+pub mod spacing;
 mod stl;
 mod text;
 pub mod write;
@@ -17,7 +21,9 @@ pub mod write;
 use glam::DVec3;
 
 pub use error::{Fault, Place, PointsError};
+pub use neighbors::Neighbors;
 pub use read::{Format, Read, Unit, parse, read};
+pub use spacing::{Spacing, noise_mm, spacing};
 pub use write::{Column, Encoding, write_ply, write_scan, write_xyz};
 
 /// The frame that coordinates are given in.

@@ -7,7 +7,12 @@
 mod build;
 mod characteristic;
 mod conclusion;
+mod csv;
 mod figure;
+mod file;
+mod html;
+mod ply;
+mod table;
 pub mod wire;
 
 use std::collections::BTreeMap;
@@ -15,6 +20,10 @@ use std::time::SystemTime;
 
 use acies_drivers::device::{Identity, Losses};
 
+pub use file::ReportError;
+pub use html::content_security_policy;
+pub use ply::to_ply;
+pub use table::print_table;
 pub use wire::Report;
 
 /// What a report says beside what the inspection found.

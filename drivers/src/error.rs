@@ -156,6 +156,12 @@ pub enum DecodeError {
         /// The message's name in the manual.
         message: &'static str,
     },
+    /// A reply of another kind than the command's.
+    #[error("{command} was answered by a message of another kind")]
+    WrongReply {
+        /// The command's name in the manual.
+        command: &'static str,
+    },
     /// A line that follows no form of the manual.
     #[error("the line {line:?} is none the controller may send")]
     Line {
@@ -308,7 +314,7 @@ pub enum DeviceError {
     },
     /// The probe met nothing on its way.
     #[error(
-        "{port}: no contact between {start_mm:?} and {target_mm:?} mm; check that the part lies there and the probe is wired"
+        "{port}: no contact between {start_mm:?} and {target_mm:?} mm; check that the part lies there and the probe is wired, then reopen with `unlock_on_open = true` or send $X"
     )]
     NoContact {
         /// Port or address.
@@ -317,6 +323,34 @@ pub enum DeviceError {
         start_mm: [f64; 3],
         /// Where it ended, mm, machine axes.
         target_mm: [f64; 3],
+    },
+    /// A contact away from the way that was commanded.
+    #[error(
+        "{port}: contact is reported at {contact_mm:?} mm, {off_mm:.3} mm off the way; check for lost steps and a changed work offset, then home and reopen it"
+    )]
+    OffWay {
+        /// Port or address.
+        port: String,
+        /// As reported, mm, machine axes.
+        contact_mm: [f64; 3],
+        /// Distance from the way, mm.
+        off_mm: f64,
+    },
+    /// A probe cycle that ended without a result.
+    #[error(
+        "{port}: the move ended, but no result came, nor was there one in $#; check the controller's firmware"
+    )]
+    NoResult {
+        /// Port or address.
+        port: String,
+    },
+    /// The controller started anew, so that its position is lost.
+    #[error(
+        "{port}: the controller reset itself; check its supply, home the machine, then reopen it"
+    )]
+    ControllerReset {
+        /// Port or address.
+        port: String,
     },
     /// A move that leaves the permitted box, or makes no sense.
     #[error("{port}: a move to {asked_mm:?} mm is not permitted, allowed is {allowed}")]

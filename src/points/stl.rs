@@ -28,7 +28,9 @@ fn length(facets: u32) -> u64 {
 /// # Errors
 /// With the line (ascii) or byte (binary) of the first fault.
 pub(crate) fn parse(bytes: &[u8], unit: Unit) -> Result<Parsed, Malformed> {
-    let is_ascii = bytes.trim_ascii_start().starts_with(b"solid") && !is_binary(bytes);
+    // Some programs begin a binary file with `solid` too; its count of facets shows as a control character.
+    let head = &bytes[..bytes.len().min(HEADER)];
+    let is_ascii = bytes.trim_ascii_start().starts_with(b"solid") && !head.contains(&0);
     let mut parsed = if is_ascii {
         parse_ascii(bytes, unit)
     } else {

@@ -25,10 +25,14 @@ impl Report {
             .map(|edge| edge_from_result(edge, &facts.limits, &mut findings))
             .collect();
         let alignment = alignment_from_result(&inspection.alignment);
+        // A good alignment makes no part OK: where no value was judged, nothing was.
+        let beside_the_edges = [status_from_verdict(inspection.verdict), alignment.status]
+            .into_iter()
+            .filter(|status| *status > Status::Ok);
         let verdict = edges
             .iter()
             .map(|edge| edge.verdict)
-            .chain([status_from_verdict(inspection.verdict), alignment.status])
+            .chain(beside_the_edges)
             .max()
             .unwrap_or(Status::Undefined);
         let mut report = Report {
@@ -70,8 +74,11 @@ fn rfc3339(time: SystemTime) -> String {
     humantime::format_rfc3339_seconds(time.clamp(UNIX_EPOCH, end_of_9999)).to_string()
 }
 
+/// Beyond this (a thousand kilometres in mm) a number is as useless as infinity, and squares of it would overflow later.
+const LARGEST: f64 = 1e9;
+
 fn finite(value: f64) -> Option<f64> {
-    value.is_finite().then_some(value)
+    (value.abs() <= LARGEST).then_some(value)
 }
 
 fn degrees(angle_rad: f64) -> Option<f64> {
@@ -79,7 +86,8 @@ fn degrees(angle_rad: f64) -> Option<f64> {
 }
 
 fn xyz(v: DVec3) -> Option<wire::Xyz> {
-    v.is_finite().then(|| v.to_array())
+    let [x, y, z] = v.to_array().map(finite);
+    Some([x?, y?, z?])
 }
 
 fn status_from_verdict(verdict: Verdict) -> Status {
@@ -117,7 +125,7 @@ fn recipe_from_facts(facts: &LimitFacts) -> wire::Recipe {
 }
 
 fn finite_limits(limits: Option<[f64; 2]>) -> Option<[f64; 2]> {
-    limits.filter(|limits| limits.iter().all(|limit| limit.is_finite()))
+    limits.filter(|limits| limits.iter().all(|limit| finite(*limit).is_some()))
 }
 
 fn limits_in_degrees(limits_rad: Option<[f64; 2]>) -> Option<[f64; 2]> {
@@ -172,21 +180,21 @@ fn devices_from_facts(facts: &Facts) -> Vec<wire::Device> {
 
 fn alignment_from_result(alignment: &Alignment) -> wire::Alignment {
     let matrix = alignment.part_from_machine.matrix();
+    let rows = matrix.transpose().to_cols_array_2d();
+    let has_pose = rows.iter().flatten().all(|entry| finite(*entry).is_some());
     let covariance = alignment.covariance;
     let mut status = status_from_verdict(alignment.status);
-    if !matrix.is_finite() {
+    if !has_pose {
         status = status.max(Status::NotDecidable);
     }
     wire::Alignment {
-        part_from_machine: matrix
-            .is_finite()
-            .then(|| matrix.transpose().to_cols_array_2d()),
+        part_from_machine: has_pose.then_some(rows),
         rms_mm: finite(alignment.rms_mm),
         points: alignment.points,
         covariance: covariance
             .iter()
             .flatten()
-            .all(|entry| entry.is_finite())
+            .all(|entry| finite(*entry).is_some())
             .then_some(covariance),
         weak_directions: alignment.weak_directions.clone(),
         status,
@@ -209,7 +217,7 @@ fn edge_from_result(
                 stations.push(station);
             }
             None => findings.push(format!(
-                "edge {}: the nominal place of station {index} is not finite; the station is left out",
+                "edge {}: the nominal place of station {index} {NOT_FINITE}; the station is left out",
                 edge.id
             )),
         }
@@ -269,7 +277,7 @@ fn evaluate(
     (summary, characteristics)
 }
 
-const NOT_FINITE: &str = "is not a finite number";
+const NOT_FINITE: &str = "is not a number below 1e9";
 
 /// `None` where the nominal place itself is not finite.
 fn station_from_result(result: &StationResult, kind: EdgeKind) -> Option<wire::Station> {

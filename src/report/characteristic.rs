@@ -23,9 +23,9 @@ pub struct Criterion {
     pub rule: Rule,
 }
 
-/// The measured values of `quantity` along the edge, in order.
-pub fn samples(stations: &[Station], quantity: Quantity) -> Vec<Sample> {
-    let pick = |station: &Station| match quantity {
+/// `quantity` at one station; `None` where it was not measured.
+pub fn sample(station: &Station, quantity: Quantity) -> Option<Sample> {
+    let (value, u) = match quantity {
         Quantity::D1 => (station.d1_mm, station.u_d1_mm),
         Quantity::D2 => (station.d2_mm, station.u_d2_mm),
         Quantity::AngleDeviation => (
@@ -35,16 +35,18 @@ pub fn samples(stations: &[Station], quantity: Quantity) -> Vec<Sample> {
             station.u_included_angle_deg,
         ),
     };
+    value.map(|value| Sample {
+        s_mm: station.s_mm,
+        value,
+        u,
+    })
+}
+
+/// The measured values of `quantity` along the edge, in order.
+pub fn samples(stations: &[Station], quantity: Quantity) -> Vec<Sample> {
     stations
         .iter()
-        .filter_map(|station| {
-            let (value, u) = pick(station);
-            value.map(|value| Sample {
-                s_mm: station.s_mm,
-                value,
-                u,
-            })
-        })
+        .filter_map(|station| sample(station, quantity))
         .collect()
 }
 

@@ -285,3 +285,38 @@ pub fn facts() -> Facts {
         },
     }
 }
+
+/// Puts `bad` in the place of a number: 1 to 8 a measured value of the first edge, the others elsewhere.
+pub fn spoil(
+    inspection: &mut Inspection,
+    facts: &mut Facts,
+    (place, station): (usize, usize),
+    bad: f64,
+) {
+    let edge = &mut inspection.edges[0];
+    let result = &mut edge.stations[station];
+    let measured = result
+        .measured
+        .as_mut()
+        .expect("the first edge is measured everywhere");
+    match place {
+        1 => measured.point.x = bad,
+        2 | 3 => measured.d_mm[place - 2] = bad,
+        4 | 5 => measured.u_d_mm[place - 4] = bad,
+        6 => measured.included_angle_rad = bad,
+        7 => measured.u_included_angle_rad = bad,
+        8 => measured.d_mm = [bad; 2],
+        9 => measured.residual_mm = [bad; 2],
+        10 => result.station.s_mm = bad,
+        11 => result.station.point.y = bad,
+        12 => result.station.normals[1].z = bad,
+        13 => edge.length_mm = bad,
+        14 => edge.coverage = bad,
+        15 => inspection.alignment.rms_mm = bad,
+        16 => inspection.alignment.covariance[2][3] = bad,
+        17 => inspection.alignment.part_from_machine.translation.x = bad,
+        18 => inspection.unexpected_edges[0][1].z = bad,
+        19 => facts.scan.noise_mm = Some(bad),
+        _ => facts.limits.all.d1_mm = Some([-bad, bad]),
+    }
+}
