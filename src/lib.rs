@@ -10,6 +10,8 @@ pub mod geometry;
 
 pub mod features;
 
+pub mod surface;
+
 pub mod nominal;
 
 pub mod inspect;
