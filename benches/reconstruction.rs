@@ -27,7 +27,22 @@ fn main() {
     }
     println!(
         "{:<34}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>7}{:>7}{:>7}{:>8}{:>8}{:>7}{:>8}",
-        "cloud", "in flat", "in edge", "flat", "edge", "gap own", "gap", "worst", "proj", "n flat", "n edge", "n meas", "line", "l worst", "lines", "seconds"
+        "cloud",
+        "in flat",
+        "in edge",
+        "flat",
+        "edge",
+        "gap own",
+        "gap",
+        "worst",
+        "proj",
+        "n flat",
+        "n edge",
+        "n meas",
+        "line",
+        "l worst",
+        "lines",
+        "seconds"
     );
     for trial in &trials {
         row(trial);
@@ -38,12 +53,28 @@ fn row(trial: &Trial) {
     let cloud = figures::cloud_of(&trial.seen);
     let neighbors = acies::points::Neighbors::new(&cloud.positions);
     let start = std::time::Instant::now();
-    let result = acies::surface::reconstruct(&cloud, &neighbors, Settings::default()).expect("enough points");
+    let result = acies::surface::reconstruct(&cloud, &neighbors, Settings::default())
+        .expect("enough points");
     let seconds = start.elapsed().as_secs_f64();
     let f = trial.figures(&result);
     println!(
         "{:<34}{:>8.4}{:>8.4}{:>8.4}{:>8.4}{:>8.3}{:>8.3}{:>8.3}{:>8.4}{:>7.2}{:>7.2}{:>7.2}{:>8.4}{:>8.3}{:>7}{:>8.2}   {:?}",
-        trial.name, f.input_flat, f.input_edge, f.flat, f.edge, f.edge_gap_own, f.edge_gap, f.worst, f.projected, f.normal_flat, f.normal_edge,
-        f.normal_edge_measured, f.line_rms, f.line_worst, f.lines, seconds, result.scale
+        trial.name,
+        f.input_flat,
+        f.input_edge,
+        f.flat,
+        f.edge,
+        f.edge_gap_own,
+        f.edge_gap,
+        f.worst,
+        f.projected,
+        f.normal_flat,
+        f.normal_edge,
+        f.normal_edge_measured,
+        f.line_rms,
+        f.line_worst,
+        f.lines,
+        seconds,
+        result.scale
     );
 }

@@ -59,7 +59,8 @@ impl Grid {
 /// Samples no two of which are nearer than `spacing_mm`; corners go first.
 pub(super) fn thin_lines(lines: Vec<LinePoint>, spacing_mm: f64) -> Vec<LinePoint> {
     let mut grid = Grid::new(spacing_mm.max(f64::MIN_POSITIVE));
-    let (corners, edges): (Vec<_>, Vec<_>) = lines.into_iter().partition(|l| l.place == Place::Corner);
+    let (corners, edges): (Vec<_>, Vec<_>) =
+        lines.into_iter().partition(|l| l.place == Place::Corner);
     corners
         .into_iter()
         .chain(edges)
@@ -130,7 +131,11 @@ fn fill(surface: &Surface, apart: f64, (grid, out): (&mut Grid, &mut Resampled))
             .flat_map_iter(|(p, n)| around(surface, *p, *n, apart))
             .collect();
         for (position, normal, place) in candidates {
-            let distance = if place == Place::Face { apart } else { 0.5 * apart };
+            let distance = if place == Place::Face {
+                apart
+            } else {
+                0.5 * apart
+            };
             if grid.take(position, distance) {
                 out.push(position, normal, place);
             }
@@ -141,7 +146,10 @@ fn fill(surface: &Surface, apart: f64, (grid, out): (&mut Grid, &mut Resampled))
 
 /// Six places around `p` on the surface.
 fn around(surface: &Surface, p: DVec3, normal: Vec3, apart: f64) -> Vec<(DVec3, Vec3, Place)> {
-    let (u, v) = normal.as_dvec3().normalize_or(DVec3::Z).any_orthonormal_pair();
+    let (u, v) = normal
+        .as_dvec3()
+        .normalize_or(DVec3::Z)
+        .any_orthonormal_pair();
     (0..6)
         .filter_map(|k| {
             let (sine, cosine) = (f64::from(k) * std::f64::consts::FRAC_PI_3).sin_cos();
