@@ -143,8 +143,11 @@ impl DemoCell {
             ("left", "SIM-LEFT", DVec3::new(-0.55, -0.45, 0.70), -1.0),
             ("right", "SIM-RIGHT", DVec3::new(0.55, 0.45, 0.70), 1.0),
         ];
+        // Both are on one stage, which runs until the slower of them has passed the part.
+        let profiles = sensors.map(|(_, _, from, _)| stand(from.normalize()).1);
+        let profiles = profiles[0].max(profiles[1]);
         let sensors = sensors.map(|(name, serial, from, camera_side)| {
-            let (stated, profiles) = stand(from.normalize());
+            let (stated, _) = stand(from.normalize());
             let [translation_mm, rotation_rad] = options.calibration_error;
             let error = Pose::normal_draw(&mut rng, translation_mm, rotation_rad);
             DemoSensor {
@@ -234,8 +237,11 @@ fn misplacement(rng: &mut ChaCha8Rng) -> Pose {
     let (shift, axis) = (unit(), unit());
     let [distance, angle]: [f64; 2] = rng.random();
     let centre = DVec3::new(0.5 * PLATE_MM[0], 0.5 * PLATE_MM[1], PLATE_TOP_MM);
-    Pose::shift(shift * distance * MISPLACED_MM)
-        .after(Pose::turn_about(centre, axis, angle * MISTURNED_RAD))
+    Pose::shift(shift * distance * MISPLACED_MM).after(Pose::turn_about(
+        centre,
+        axis,
+        angle * MISTURNED_RAD,
+    ))
 }
 
 fn optics(camera_side: f64) -> Optics {
@@ -268,7 +274,12 @@ fn stand(from: DVec3) -> (Pose, u32) {
     let heights = [LOWEST_SEEN_MM, PLATE_TOP_MM, TOP.range()[1]];
     for (i, z) in heights.into_iter().enumerate() {
         let length = if i == 2 { TOP.x[1] } else { PLATE_MM[0] };
-        for (x, y) in [(0.0, 0.0), (length, 0.0), (0.0, PLATE_MM[1]), (length, PLATE_MM[1])] {
+        for (x, y) in [
+            (0.0, 0.0),
+            (length, 0.0),
+            (0.0, PLATE_MM[1]),
+            (length, PLATE_MM[1]),
+        ] {
             let seen = plane * (FIXTURE_MM + DVec3::new(x, y, z));
             low = low.min(seen);
             high = high.max(seen);

@@ -151,15 +151,28 @@ impl Controller {
 
     fn system(&mut self, line: &str, out: &mut Outbox) -> Result<(), GrblError> {
         match line.to_ascii_uppercase().as_str() {
-            "$" => self.say("[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]", out),
+            "$" => self.say(
+                "[HLP:$$ $# $G $I $N $x=val $Nx=line $J=line $SLP $C $X $H ~ ! ? ctrl-x]",
+                out,
+            ),
             "$$" => {
-                for setting in ["$0=10", "$10=1", "$13=0", "$20=0", "$21=0", "$22=0", "$110=6000.000"] {
+                for setting in [
+                    "$0=10",
+                    "$10=1",
+                    "$13=0",
+                    "$20=0",
+                    "$21=0",
+                    "$22=0",
+                    "$110=6000.000",
+                ] {
                     self.say(setting, out);
                 }
             }
             "$#" => {
                 let zero = triple(DVec3::ZERO);
-                for name in ["G54", "G55", "G56", "G57", "G58", "G59", "G28", "G30", "G92"] {
+                for name in [
+                    "G54", "G55", "G56", "G57", "G58", "G59", "G28", "G30", "G92",
+                ] {
                     self.say(&format!("[{name}:{zero}]"), out);
                 }
                 self.say("[TLO:0.000]", out);
@@ -254,7 +267,14 @@ impl Controller {
         }
     }
 
-    fn probe(&mut self, target: DVec3, must_touch: bool, away: bool, now: Instant, out: &mut Outbox) {
+    fn probe(
+        &mut self,
+        target: DVec3,
+        must_touch: bool,
+        away: bool,
+        now: Instant,
+        out: &mut Outbox,
+    ) {
         self.probings += 1;
         let start = self.position;
         let direction = (target - start).normalize();
