@@ -463,6 +463,24 @@ fn profiles_missing_at_the_end_are_found_by_stopped() {
 }
 
 #[test]
+fn a_stop_that_is_not_confirmed_leaves_the_profiles_to_next() {
+    let (fake, mut profiler, run) = running(Model::default());
+    fake.lock().device.mute = true;
+    for sequence in 0..2 {
+        fake.send(&profile(sequence, run, BOOT, 4));
+    }
+    let error = profiler.stop().expect_err("silence");
+    assert!(
+        text(&error).contains("no answer within"),
+        "{}",
+        text(&error)
+    );
+    assert_eq!(next(&mut profiler).expect("a profile"), 0);
+    assert_eq!(next(&mut profiler).expect("a profile"), 1);
+    assert!(next(&mut profiler).is_err());
+}
+
+#[test]
 fn a_device_gone_in_the_middle_of_a_run_is_told_after_its_last_profile() {
     let (fake, mut profiler, run) = running(Model::default());
     fake.send(&profile(0, run, BOOT, 4));
