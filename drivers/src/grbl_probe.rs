@@ -6,6 +6,26 @@
 //! the work offset is read at opening and taken off; after an alarm everything is locked until `$X` or `$H`.
 //!
 //! What counts is the position that the controller latched at contact, never a position asked for afterwards.
+//!
+//! # Configuration
+//!
+//! Only the link is needed. Places are in machine axes, mm.
+//!
+//! ```toml
+//! port = "/dev/ttyUSB0"         # or one of the next three in its place
+//! # usb_serial = "A50285BI"     # serial number of the USB converter: the same after plugging in again
+//! # usb_id = "1a86:7523"        # vendor and product of a converter without one
+//! # address = "10.0.0.6:23"     # TCP, as of a network bridge
+//! baud = 115200                 # serial ports only
+//! build_info = "probe 7"        # text that `$I=` wrote into the controller: another one is refused
+//! feed_mm_min = 100.0           # of probing moves
+//! rapid = true                  # to the start with G0; otherwise with G1 at the feed above
+//! safe_z_mm = 150.0             # the way to a start goes up to this, across, and down; straight where not given
+//! retract_mm = 2.0              # back from the contact, never behind the start
+//! limits_min_mm = [0.0, 0.0, -80.0] # box that starts and targets must lie in
+//! limits_max_mm = [300.0, 200.0, 160.0]
+//! unlock_on_open = false        # send $X at opening, where an alarm has locked the machine
+//! ```
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
