@@ -185,3 +185,6 @@ pub(crate) fn wait(line: Option<BorrowedFd<'_>>, write: bool, waker: &OwnedFd, t
     // a signal or an error only wakes us early
     let _ = poll(&mut fds, Some(&timeout));
 }
+
+#[cfg(test)]
+mod tests;

@@ -356,10 +356,8 @@ impl Device {
 
     /// Ends the run if there is one; the payload of STOPPED.
     fn stop(&mut self, reason: Reason) -> Vec<u8> {
-        if self.run.take().is_some() {
-            if let Some(last) = &mut self.last {
-                last.reason = reason;
-            }
+        if let (Some(_), Some(last)) = (self.run.take(), &mut self.last) {
+            last.reason = reason;
         }
         self.laser_on = false;
         self.publish();

@@ -342,7 +342,7 @@ fn account(name: &str, faults: &str) -> (Vec<u8>, Truth) {
     let mut host = Host::open(&device);
     host.start(4, 300, 10_000);
     let mut frames = Vec::new();
-    while !(device.status().run == Some(4) && !device.status().streaming) {
+    while device.status().run != Some(4) || device.status().streaming {
         // a START that was lost is sent again
         match host.next(Duration::from_millis(300)) {
             Some(frame) => frames.push(frame),
