@@ -1,0 +1,154 @@
+//! Which points lie on a sharp edge, a corner or a boundary, and the curves through them.
+
+use std::time::Instant;
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use crate::points::{Neighbors, PointCloud, Spacing, noise_mm, spacing};
+
+mod adaptive;
+mod flanks;
+mod patch;
+pub mod profile;
+mod tangent;
+
+use adaptive::{Places, Sights};
+use tangent::Tangents;
+
+/// What a point lies on. The discriminants are the values of `feature` in files.
+#[repr(u8)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Class {
+    /// On a smooth surface.
+    None = 0,
+    /// Within about one spacing of an edge between two surfaces.
+    Edge = 1,
+    /// Within about one spacing of a place where three or more surfaces meet.
+    Corner = 2,
+    /// On the border of the data: an open edge or an occlusion.
+    Boundary = 3,
+}
+
+/// How edges are looked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Method {
+    /// Surfaces fitted on both sides; every threshold follows from noise, spacing and number of points.
+    Adaptive,
+    /// Gauss-map clustering with one sensitivity for all points (Weber 2011, §3.4).
+    Global,
+    /// Multi-scale surface variation (Pauly et al. 2003, as in Weber 2011, §3.7.7).
+    Variation,
+}
+
+/// The classes of N points and how they were found.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Detection {
+    /// N classes, in input order.
+    pub classes: Vec<Class>,
+    /// Spacing of the cloud.
+    pub spacing: Spacing,
+    /// Standard deviation of the points normal to the surface, mm.
+    pub noise_mm: f64,
+    /// Seconds by stage, in order.
+    pub seconds: Vec<(&'static str, f64)>,
+    /// What was wrong with the data; the result goes on.
+    pub findings: Vec<String>,
+}
+
+impl Detection {
+    /// Number of points of a class.
+    pub fn count(&self, class: Class) -> usize {
+        self.classes.iter().filter(|c| **c == class).count()
+    }
+}
+
+/// The class of every point of `cloud`.
+pub fn detect(cloud: &PointCloud, neighbors: &Neighbors, method: Method) -> Detection {
+    let mut clock = Clock::new();
+    let spacing = spacing(cloud, neighbors);
+    let noise = noise_mm(cloud, neighbors, &spacing);
+    clock.lap("spacing and noise");
+    let mut detection = Detection {
+        classes: vec![Class::None; cloud.positions.len()],
+        spacing,
+        noise_mm: noise,
+        seconds: Vec::new(),
+        findings: Vec::new(),
+    };
+    if neighbors.places().len() < 8 || spacing.mean_mm <= 0.0 {
+        detection
+            .findings
+            .push("points: fewer than 8 distinct places, no edge can be told".to_owned());
+        return detection;
+    }
+    let _ = method;
+    adaptive(cloud, neighbors, &mut detection, &mut clock);
+    detection.seconds = clock.laps;
+    detection
+}
+
+fn adaptive(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    detection: &mut Detection,
+    clock: &mut Clock,
+) {
+    let places = Places {
+        positions: neighbors
+            .places()
+            .iter()
+            .map(|i| cloud.positions[*i as usize])
+            .collect(),
+        neighbors,
+        spacing_mm: detection.spacing.mean_mm,
+        noise_mm: detection.noise_mm,
+    };
+    let tangents = Tangents::new(&places.positions, neighbors);
+    clock.lap("tangent planes");
+    let sights = Sights::new(&places, &tangents);
+    clock.lap("flanks");
+    let classes: Vec<Class> = (0..places.positions.len())
+        .into_par_iter()
+        .map(|rank| match places.agree(&tangents, &sights, rank) {
+            Some(edge) if edge.is_corner() => Class::Corner,
+            Some(edge) if edge.is_edge() => Class::Edge,
+            _ => Class::None,
+        })
+        .collect();
+    clock.lap("agreement");
+    for (rank, class) in classes.iter().enumerate() {
+        for i in neighbors.points_at(rank) {
+            detection.classes[*i as usize] = *class;
+        }
+    }
+}
+
+/// A polyline along an edge, mm.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Curve {
+    /// Its vertices, in order.
+    pub points: Vec<DVec3>,
+    /// Whether the last joins the first.
+    pub closed: bool,
+}
+
+struct Clock {
+    last: Instant,
+    laps: Vec<(&'static str, f64)>,
+}
+
+impl Clock {
+    fn new() -> Self {
+        Self {
+            last: Instant::now(),
+            laps: Vec::new(),
+        }
+    }
+
+    fn lap(&mut self, stage: &'static str) {
+        let now = Instant::now();
+        self.laps.push((stage, (now - self.last).as_secs_f64()));
+        self.last = now;
+    }
+}

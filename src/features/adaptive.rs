@@ -1,0 +1,322 @@
+//! The detector as users get it.
+//!
+//! Weber's idea is kept: near a sharp edge the Gauss map of a neighbourhood falls into clusters. We differ in what is mapped
+//! and how clusters are told apart: see [`super::Method::Adaptive`].
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::flanks::{Crease, FAR, Verdict, Workshop};
+use super::patch::Plane;
+use super::tangent::{Tangents, drop_ties};
+use crate::points::Neighbors;
+
+/// Points looked at around a candidate, one level after the other as long as the answer is open.
+const LEVELS: [usize; 3] = [40, 100, 220];
+/// Flanks are allowed to depart from a quadric by this many spacings beside the noise.
+const MODEL_ERROR: f64 = 0.025;
+/// A point is marked when the edge passes within this many spacings.
+const THIN: f64 = 0.9;
+/// Share of the neighbours that must see an edge for it to be believed.
+const AGREEMENT: f64 = 0.3;
+
+/// What the detector works on: distinct places in Morton order.
+pub(super) struct Places<'a> {
+    /// Coordinates by rank, mm.
+    pub positions: Vec<DVec3>,
+    /// Ranks them in the same order.
+    pub neighbors: &'a Neighbors,
+    /// Spacing, mm.
+    pub spacing_mm: f64,
+    /// Noise, mm.
+    pub noise_mm: f64,
+}
+
+/// The edge near a place, relative to it, mm.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sight {
+    pub foot: DVec3,
+    pub tangent: DVec3,
+    pub turn: f64,
+    pub sd_mm: f64,
+    pub corner: Option<DVec3>,
+}
+
+/// An edge that several neighbourhoods agree upon, as seen from one place.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Agreed {
+    /// From the place to the edge, mm.
+    pub foot: DVec3,
+    pub tangent: DVec3,
+    /// In units of the spacing at the place.
+    pub distance: f64,
+    /// From the place to the corner, spacings.
+    pub corner_distance: Option<f64>,
+}
+
+impl Agreed {
+    pub fn is_edge(&self) -> bool {
+        self.distance < THIN
+    }
+
+    pub fn is_corner(&self) -> bool {
+        self.corner_distance.is_some_and(|d| d < THIN)
+    }
+}
+
+impl Places<'_> {
+    /// Noise variance in squares of `unit_mm`, with what a flank may depart from its model.
+    fn variance(&self, unit_mm: f64) -> f64 {
+        (self.noise_mm / unit_mm).powi(2) + MODEL_ERROR * MODEL_ERROR
+    }
+
+    /// The unit of length at a place: the cloud's spacing, or the local one where that is very different.
+    pub fn unit_mm(&self, reach_mm: f64, count: usize) -> f64 {
+        let local = reach_mm * (std::f64::consts::PI / (count.max(2) - 1) as f64).sqrt();
+        if local > 1.7 * self.spacing_mm || local < 0.6 * self.spacing_mm {
+            local
+        } else {
+            self.spacing_mm
+        }
+    }
+
+    /// Flatness test: whether the neighbourhood departs from a plane by more than noise does.
+    pub fn is_candidate(&self, tangents: &Tangents, rank: usize) -> bool {
+        let plane = &tangents.planes[rank];
+        let n = tangents.around(rank).len();
+        if n < 8 {
+            return false;
+        }
+        let unit = self.unit_mm(f64::from(plane.reach_mm), n);
+        let variance = self.variance(unit);
+        let seen = f64::from(plane.variance_mm2) / (unit * unit);
+        let freedom = n as f64 - 3.0;
+        if seen * n as f64 > variance * (freedom + 3.0 * (2.0 * freedom).sqrt()) {
+            return true;
+        }
+        // A normal over n points within radius r is good to 2 sigma / (r sqrt n) about each of two axes.
+        let reach = f64::from(plane.reach_mm) / unit;
+        let tilt = 4.0 * variance / (reach * reach * n as f64);
+        tangents.spread(rank) > 3.0 * tilt
+    }
+
+    /// What is seen from the candidate `rank`, by growing its neighbourhood until the answer is clear.
+    pub fn look(&self, tangents: &Tangents, rank: usize, shop: &mut Bench) -> Option<Sight> {
+        let p = self.positions[rank];
+        let mut guess = None;
+        for level in LEVELS {
+            self.neighbors.nearest_places(p, level, &mut shop.found);
+            drop_ties(&mut shop.found);
+            let reach = shop.found.last().map_or(0.0, |f| f.1.sqrt());
+            let unit = self.unit_mm(reach, shop.found.len());
+            self.fill(tangents, p, unit, shop);
+            match shop.flanks.analyse(self.variance(unit)) {
+                Verdict::Smooth => return None,
+                Verdict::Creased(crease) => return Some(in_mm(crease, unit)),
+                Verdict::Unsure(crease) => guess = crease.map(|c| in_mm(c, unit)),
+            }
+        }
+        let _ = guess;
+        None
+    }
+
+    /// Puts the neighbourhood and the best tangent planes in it on the bench.
+    fn fill(&self, tangents: &Tangents, p: DVec3, unit: f64, shop: &mut Bench) {
+        const APART: f64 = 1.3;
+        const SEEDS: usize = 8;
+        let points = &mut shop.flanks.points;
+        points.clear();
+        points.extend(
+            shop.found
+                .iter()
+                .map(|(r, _)| (self.positions[*r as usize] - p) / unit),
+        );
+        shop.ranked.clear();
+        shop.ranked.extend(
+            shop.found
+                .iter()
+                .enumerate()
+                .map(|(i, (r, _))| (tangents.planes[*r as usize].variance_mm2, i as u32)),
+        );
+        shop.ranked
+            .sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        shop.taken.clear();
+        shop.flanks.seeds.clear();
+        let reach = points[points.len() - 1].length().max(3.0);
+        let apart = APART * reach / 3.57;
+        for (_, i) in &shop.ranked {
+            let at = shop.flanks.points[*i as usize];
+            if shop
+                .taken
+                .iter()
+                .all(|t: &DVec3| t.distance_squared(at) > apart * apart)
+            {
+                shop.taken.push(at);
+                let plane = &tangents.planes[shop.found[*i as usize].0 as usize];
+                let normal = plane.normal();
+                shop.flanks.seeds.push(Plane {
+                    normal,
+                    offset: normal.dot(at) - f64::from(plane.height_mm) / unit,
+                });
+                if shop.taken.len() == SEEDS {
+                    break;
+                }
+            }
+        }
+    }
+
+    /// The edge near `rank` that its neighbours agree upon.
+    pub fn agree(&self, tangents: &Tangents, sights: &Sights, rank: usize) -> Option<Agreed> {
+        let p = self.positions[rank];
+        let around = tangents.around(rank);
+        let unit = self.unit_mm(f64::from(tangents.planes[rank].reach_mm), around.len());
+        let mut seen: [(DVec3, Sight); super::tangent::NEAR] =
+            [(DVec3::ZERO, NOTHING); super::tangent::NEAR];
+        let mut count = 0;
+        for j in around {
+            if let Some(sight) = sights.at(*j as usize) {
+                let foot = (self.positions[*j as usize] + sight.foot - p) / unit;
+                if foot.length_squared() < FAR * FAR {
+                    seen[count] = (foot, *sight);
+                    count += 1;
+                }
+            }
+        }
+        let seen = &seen[..count];
+        let needed = ((around.len() as f64 * AGREEMENT) as usize).max(3);
+        let mut best: Option<Agreed> = None;
+        for (foot, sight) in seen.iter().take(8) {
+            let (votes, at) = fit_feet(seen, (*foot, sight.tangent), unit)?;
+            let distance = at.length();
+            if votes >= needed && best.is_none_or(|b| distance < b.distance) {
+                best = Some(Agreed {
+                    foot: at * unit,
+                    tangent: sight.tangent,
+                    distance,
+                    corner_distance: None,
+                });
+            }
+        }
+        let mut agreed = best?;
+        agreed.corner_distance = self.corner(around, sights, (p, unit));
+        Some(agreed)
+    }
+
+    fn corner(&self, around: &[u32], sights: &Sights, (p, unit): (DVec3, f64)) -> Option<f64> {
+        let corners = around.iter().filter_map(|j| {
+            let c = sights.at(*j as usize)?.corner?;
+            Some((self.positions[*j as usize] + c - p) / unit)
+        });
+        let (mut sum, mut n) = (DVec3::ZERO, 0);
+        let nearest =
+            corners.clone().fold(
+                DVec3::INFINITY,
+                |a, b| if b.length() < a.length() { b } else { a },
+            );
+        for c in corners.filter(|c| c.distance_squared(nearest) < 1.5) {
+            sum += c;
+            n += 1;
+        }
+        (n >= 4).then(|| (sum / f64::from(n)).length())
+    }
+}
+
+const NOTHING: Sight = Sight {
+    foot: DVec3::ZERO,
+    tangent: DVec3::ZERO,
+    turn: 0.0,
+    sd_mm: 0.0,
+    corner: None,
+};
+
+/// How many feet lie along one curve with the reference, and where that curve passes: quadratic in the way along the tangent.
+fn fit_feet(
+    seen: &[(DVec3, Sight)],
+    (foot, tangent): (DVec3, DVec3),
+    unit: f64,
+) -> Option<(usize, DVec3)> {
+    let mut a = [[0.0; 3]; 3];
+    let mut b = [DVec3::ZERO; 3];
+    let mut votes = 0;
+    for (f, s) in seen {
+        let d = *f - foot;
+        let along = d.dot(tangent);
+        let off = d - tangent * along;
+        if s.tangent.dot(tangent).abs() < 0.8 || off.length_squared() > 1.0 {
+            continue;
+        }
+        votes += 1;
+        let x = f.dot(tangent);
+        let sd = s.sd_mm / unit;
+        let w = (-0.25 * x * x).exp() / (sd * sd + 0.05 * 0.05);
+        let row = [1.0, x, x * x];
+        for i in 0..3 {
+            b[i] += (*f - tangent * x) * (w * row[i]);
+            for j in 0..3 {
+                a[i][j] += w * row[i] * row[j];
+            }
+        }
+    }
+    // Bending is held back a little, so that few feet give a straight line.
+    a[1][1] += 0.02 * a[0][0];
+    a[2][2] += 0.1 * a[0][0];
+    let m = glam::DMat3::from_cols_array_2d(&a);
+    let det = m.determinant();
+    if det <= 1e-12 * a[0][0].powi(3) {
+        return Some((votes, b[0] / a[0][0]));
+    }
+    let first = m.inverse().row(0);
+    Some((votes, b[0] * first.x + b[1] * first.y + b[2] * first.z))
+}
+
+/// What each candidate sees.
+pub(super) struct Sights {
+    /// Index into `seen` by rank, or `u32::MAX`.
+    index: Vec<u32>,
+    seen: Vec<Sight>,
+}
+
+impl Sights {
+    pub fn new(places: &Places, tangents: &Tangents) -> Self {
+        let all: Vec<(u32, Sight)> = (0..places.positions.len())
+            .into_par_iter()
+            .map_init(Bench::default, |bench, rank| {
+                if !places.is_candidate(tangents, rank) {
+                    return None;
+                }
+                places.look(tangents, rank, bench).map(|s| (rank as u32, s))
+            })
+            .flatten_iter()
+            .collect();
+        let mut index = vec![u32::MAX; places.positions.len()];
+        let mut seen = Vec::with_capacity(all.len());
+        for (rank, sight) in all {
+            index[rank as usize] = seen.len() as u32;
+            seen.push(sight);
+        }
+        Self { index, seen }
+    }
+
+    pub fn at(&self, rank: usize) -> Option<&Sight> {
+        self.seen.get(self.index[rank] as usize)
+    }
+}
+
+/// Working memory of one thread.
+#[derive(Default)]
+pub(super) struct Bench {
+    found: Vec<(u32, f64)>,
+    ranked: Vec<(f32, u32)>,
+    taken: Vec<DVec3>,
+    flanks: Workshop,
+}
+
+fn in_mm(crease: Crease, unit: f64) -> Sight {
+    Sight {
+        foot: crease.foot * unit,
+        tangent: crease.tangent,
+        turn: crease.turn,
+        sd_mm: crease.sd * unit,
+        corner: crease.corner.map(|c| c * unit),
+    }
+}

@@ -1,0 +1,395 @@
+//! Splits a neighbourhood into the smooth surfaces it is made of, and finds the creases between them.
+
+use glam::DVec3;
+
+use super::patch::{Fit, Plane, Surface, fit, foot, meeting};
+
+/// Most surfaces a neighbourhood is split into before those that join smoothly are merged.
+const MOST_PLANES: usize = 5;
+/// Most seeds among which the first two planes are chosen.
+const MOST_SEEDS: usize = 16;
+/// Label of a point that belongs to no surface.
+const STRAY: u8 = u8::MAX;
+/// A crease is believed where the criterion prefers it by this much, and disbelieved where it is against it by [`AGAINST`].
+const DECISIVE: f64 = 10.0;
+const AGAINST: f64 = 6.0;
+/// Smallest turn angle, rad, that counts as sharp: 6 degrees.
+const LEAST_TURN: f64 = 0.105;
+/// Farthest foot, in spacings, that is of interest.
+pub(super) const FAR: f64 = 2.6;
+
+/// An edge as one neighbourhood sees it, relative to its point, in spacings.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Crease {
+    /// Nearest point of the edge.
+    pub foot: DVec3,
+    /// Unit tangent there; its sign is arbitrary.
+    pub tangent: DVec3,
+    /// Angle between the normals, 0 to pi.
+    pub turn: f64,
+    /// Standard deviation of the foot across the edge.
+    pub sd: f64,
+    /// Where three or more surfaces meet nearby.
+    pub corner: Option<DVec3>,
+}
+
+/// What a neighbourhood is.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Verdict {
+    /// One smooth surface, or an edge too far away to be of interest.
+    Smooth,
+    /// Neither can be excluded: a larger neighbourhood is needed. Holds the better guess.
+    Unsure(Option<Crease>),
+    /// An edge.
+    Creased(Crease),
+}
+
+/// Working memory of the analysis; one a thread.
+#[derive(Default)]
+pub(super) struct Workshop {
+    /// The points, relative to the one in question, in spacings; that one first.
+    pub points: Vec<DVec3>,
+    /// Plausible planes from outside.
+    pub seeds: Vec<Plane>,
+    costs: Vec<f64>,
+    labels: Vec<u8>,
+    near: Vec<(f64, u32)>,
+}
+
+impl Workshop {
+    /// What the neighbourhood in `points` is, at noise of variance `variance` (spacings squared).
+    pub fn analyse(&mut self, variance: f64) -> Verdict {
+        if self.points.len() < 8 {
+            return Verdict::Smooth;
+        }
+        let all = Plane::through(self.points.iter().copied());
+        self.add_small_planes();
+        self.seeds.push(all);
+        let mut planes = self.choose_planes(variance);
+        if planes.len() < 2 {
+            return Verdict::Smooth;
+        }
+        self.assign(&mut planes, variance);
+        let (fits, doubt) = self.merge(planes.len() as u8, variance);
+        if fits.len() < 2 {
+            return if doubt < AGAINST {
+                Verdict::Unsure(None)
+            } else {
+                Verdict::Smooth
+            };
+        }
+        match self.nearest_crease(fits, variance) {
+            None => Verdict::Smooth,
+            Some(crease) if doubt < DECISIVE => Verdict::Unsure(Some(crease)),
+            Some(crease) => Verdict::Creased(crease),
+        }
+    }
+
+    /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
+    fn add_small_planes(&mut self) {
+        const SMALL: usize = 7;
+        let n = self.points.len();
+        self.costs.clear();
+        self.costs.resize(n, f64::INFINITY);
+        let mut at = n - 1;
+        for _ in 0..8 {
+            if self.seeds.len() >= MOST_SEEDS - 1 {
+                break;
+            }
+            let centre = self.points[at];
+            self.near.clear();
+            for (i, p) in self.points.iter().enumerate() {
+                let d = p.distance_squared(centre);
+                self.costs[i] = self.costs[i].min(d);
+                self.near.push((d, i as u32));
+            }
+            let k = SMALL.min(n - 1);
+            self.near
+                .select_nth_unstable_by(k, |a, b| a.0.total_cmp(&b.0));
+            let points = &self.points;
+            self.seeds.push(Plane::through(
+                self.near[..k].iter().map(|(_, i)| points[*i as usize]),
+            ));
+            at = (0..n).fold(0, |best, i| {
+                if self.costs[i] > self.costs[best] {
+                    i
+                } else {
+                    best
+                }
+            });
+        }
+    }
+
+    /// The fewest seeds that explain the points: the best pair, then one after another as long as each explains enough.
+    fn choose_planes(&mut self, variance: f64) -> Vec<Plane> {
+        let n = self.points.len();
+        let cap = 9.0 * variance;
+        self.costs.clear();
+        for seed in &self.seeds {
+            self.costs.extend(
+                self.points
+                    .iter()
+                    .map(|p| seed.distance(*p).powi(2).min(cap)),
+            );
+        }
+        let row = |s: usize| &self.costs[s * n..(s + 1) * n];
+        let single = (0..self.seeds.len())
+            .map(|s| row(s).iter().sum::<f64>())
+            .fold(f64::INFINITY, f64::min);
+        let mut best = (f64::INFINITY, 0, 0);
+        for i in 0..self.seeds.len() {
+            for j in 0..i {
+                let cost: f64 = row(i).iter().zip(row(j)).map(|(a, b)| a.min(*b)).sum();
+                if cost < best.0 {
+                    best = (cost, i, j);
+                }
+            }
+        }
+        // What a plane of pure chance gains: three parameters and the freedom of choice among the seeds.
+        let worth = variance * 3.0 * (n as f64).ln();
+        if single - best.0 < 0.5 * worth && best.0 < variance * n as f64 {
+            return Vec::new();
+        }
+        let mut chosen = vec![self.seeds[best.1], self.seeds[best.2]];
+        let mut so_far: Vec<f64> = row(best.1)
+            .iter()
+            .zip(row(best.2))
+            .map(|(a, b)| a.min(*b))
+            .collect();
+        while chosen.len() < MOST_PLANES {
+            let gain = |s: usize| -> f64 {
+                row(s)
+                    .iter()
+                    .zip(&so_far)
+                    .map(|(a, b)| (b - a).max(0.0))
+                    .sum()
+            };
+            let (s, g) = (0..self.seeds.len())
+                .map(|s| (s, gain(s)))
+                .fold((0, 0.0), |a, b| if b.1 > a.1 { b } else { a });
+            if g < 2.0 * worth {
+                break;
+            }
+            chosen.push(self.seeds[s]);
+            so_far = row(s).iter().zip(&so_far).map(|(a, b)| a.min(*b)).collect();
+        }
+        chosen
+    }
+
+    /// Gives every point to its nearest plane and fits the planes anew, a few times.
+    fn assign(&mut self, planes: &mut Vec<Plane>, variance: f64) {
+        let n = self.points.len();
+        for round in 0..3 {
+            let cap = variance * [25.0, 16.0, 9.0][round];
+            self.labels.clear();
+            for p in &self.points {
+                let (label, d) = planes
+                    .iter()
+                    .enumerate()
+                    .map(|(s, plane)| (s as u8, plane.distance(*p).powi(2)))
+                    .fold((STRAY, f64::INFINITY), |a, b| if b.1 < a.1 { b } else { a });
+                self.labels.push(if d < cap { label } else { STRAY });
+            }
+            if round == 2 {
+                break;
+            }
+            for (s, plane) in planes.iter_mut().enumerate() {
+                let members = (0..n).filter(|i| self.labels[*i] == s as u8);
+                if members.clone().count() >= 4 {
+                    *plane = Plane::through(members.map(|i| self.points[i]));
+                }
+            }
+        }
+    }
+
+    /// Merges surfaces, best first, as long as one smooth surface explains two of them as well; what remains, and the least amount by
+    /// which the criterion was for or against the last decision.
+    fn merge(&mut self, count: u8, variance: f64) -> (Vec<(u8, Fit)>, f64) {
+        let mut doubt = f64::INFINITY;
+        let mut fits: Vec<(u8, Fit)> = (0..count)
+            .filter_map(|s| {
+                let members = self.labels.iter().filter(|l| **l == s).count();
+                (members >= 4)
+                    .then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
+                    .map(|f| (s, f))
+            })
+            .collect();
+        while fits.len() > 1 {
+            let mut best: Option<(f64, usize, usize, Fit)> = None;
+            for i in 0..fits.len() {
+                for j in 0..i {
+                    let Some((parts, whole)) = self.split(&fits[i], &fits[j], variance) else {
+                        continue;
+                    };
+                    let change = whole.criterion(variance)
+                        - parts[0].criterion(variance)
+                        - parts[1].criterion(variance);
+                    if best.as_ref().is_none_or(|x| change < x.0) {
+                        best = Some((change, i, j, whole));
+                    }
+                }
+            }
+            let Some((change, i, j, union)) = best else {
+                break;
+            };
+            if change > 0.0 {
+                doubt = change;
+                break;
+            }
+            doubt = -change;
+            let (from, to) = (fits[i].0, fits[j].0);
+            for label in self.labels.iter_mut().filter(|l| **l == from) {
+                *label = to;
+            }
+            fits[j].1 = union;
+            fits.remove(i);
+        }
+        (fits, doubt)
+    }
+
+    /// The two surfaces fitted anew after giving each of their points to the side of the crease on which it lies, and one surface
+    /// through all of these points.
+    ///
+    /// The side is that of the surface which halves the angle: unlike the nearer of the two, it does not select by noise.
+    fn split(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<([Fit; 2], Fit)> {
+        let mut parts = [one.1, other.1];
+        let either = |i: usize| self.labels[i] == one.0 || self.labels[i] == other.0;
+        let mut facing = [0.0; 2];
+        for (i, p) in self.points.iter().enumerate() {
+            if self.labels[i] == one.0 {
+                facing[0] += parts[1].surface.distance(*p);
+            } else if self.labels[i] == other.0 {
+                facing[1] += parts[0].surface.distance(*p);
+            }
+        }
+        let facing = facing.map(f64::signum);
+        for _ in 0..2 {
+            let [a, b] = [parts[0].surface, parts[1].surface];
+            let second = |i: usize| {
+                let p = self.points[i];
+                facing[0] * b.distance(p) < facing[1] * a.distance(p)
+            };
+            parts = [
+                fit(&self.points, variance, |i| either(i) && !second(i))?,
+                fit(&self.points, variance, |i| either(i) && second(i))?,
+            ];
+        }
+        let whole = fit(&self.points, variance, either)?;
+        Some((parts, whole))
+    }
+
+    /// The nearest believable crease between two of the surfaces.
+    fn nearest_crease(&mut self, fits: Vec<(u8, Fit)>, variance: f64) -> Option<Crease> {
+        let mut best: Option<(f64, Crease)> = None;
+        let several = fits.len() > 2;
+        for i in 0..fits.len() {
+            for j in 0..i {
+                let Some(crease) = self.crease(&fits[i], &fits[j], variance) else {
+                    continue;
+                };
+                let d = crease.foot.length();
+                if best.as_ref().is_none_or(|b| d < b.0) {
+                    best = Some((d, crease));
+                }
+            }
+        }
+        let (_, mut crease) = best?;
+        if several {
+            crease.corner = self.corner(&fits);
+        }
+        Some(crease)
+    }
+
+    /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt.
+    fn crease(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<Crease> {
+        let (fits, _) = self.split(one, other, variance)?;
+        let surfaces = [fits[0].surface, fits[1].surface];
+        let (e, tangent) = foot(&surfaces[0], &surfaces[1], DVec3::ZERO)?;
+        if e.length_squared() > FAR * FAR {
+            return None;
+        }
+        let normals = surfaces.map(|s| s.height(e).1.normalize());
+        let across = self.directions([one.0, other.0], &surfaces, (e, tangent))?;
+        let cos = across[0].dot(across[1]);
+        let turn = (-cos).clamp(-1.0, 1.0).acos();
+        let sine = normals[0].cross(normals[1]).length().max(1e-6);
+        // At the end of a stretch of length L with n points a line is good to 2 sigma / sqrt n and its slope to sqrt 12 sigma / (L sqrt n);
+        // a parabola to 3 sigma / sqrt n and sqrt 192 sigma / (L sqrt n).
+        let (mut place, mut slope) = (0.0, 0.0);
+        for f in &fits {
+            let n = f.count as f64;
+            let length2 = (n / 1.5).max(1.0);
+            let bent = f.surface.is_curved();
+            place += if bent { 9.0 } else { 4.0 } / n;
+            slope += if bent { 192.0 } else { 12.0 } / (n * length2);
+        }
+        let turn_sd = (variance * slope).sqrt();
+        let believable =
+            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        believable.then_some(Crease {
+            foot: e,
+            tangent,
+            turn,
+            sd: (variance * place).sqrt() / sine,
+            corner: None,
+        })
+    }
+
+    /// Unit directions from the foot into each surface, across the edge.
+    fn directions(
+        &self,
+        labels: [u8; 2],
+        surfaces: &[Surface; 2],
+        (e, tangent): (DVec3, DVec3),
+    ) -> Option<[DVec3; 2]> {
+        let mut into = [DVec3::ZERO; 2];
+        for s in 0..2 {
+            let normal = surfaces[s].height(e).1.normalize();
+            let direction = normal.cross(tangent).try_normalize()?;
+            let lean: f64 = (0..self.points.len())
+                .filter(|i| self.labels[*i] == labels[s])
+                .map(|i| {
+                    let d = self.points[i] - e;
+                    d.dot(direction) / (1.0 + d.length_squared())
+                })
+                .sum();
+            into[s] = direction * lean.signum();
+        }
+        Some(into)
+    }
+
+    /// Whether both surfaces have points near the foot: a crease is where surfaces meet, not where their continuations do.
+    fn supported(&self, labels: [u8; 2], e: DVec3) -> bool {
+        const NEAR: f64 = 2.1;
+        labels.iter().all(|label| {
+            let near = (0..self.points.len())
+                .filter(|i| {
+                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
+                })
+                .count();
+            near >= 2
+        })
+    }
+
+    /// Where three of the surfaces meet, the nearest such place.
+    fn corner(&self, fits: &[(u8, Fit)]) -> Option<DVec3> {
+        let mut best: Option<DVec3> = None;
+        for i in 0..fits.len() {
+            for j in 0..i {
+                for k in 0..j {
+                    let three = [i, j, k].map(|s| &fits[s].1.surface);
+                    let Some(c) = meeting(three, DVec3::ZERO) else {
+                        continue;
+                    };
+                    let near = c.length_squared() < FAR * FAR
+                        && self.supported([fits[i].0, fits[j].0], c)
+                        && self.supported([fits[k].0, fits[k].0], c);
+                    if near && best.is_none_or(|b| c.length_squared() < b.length_squared()) {
+                        best = Some(c);
+                    }
+                }
+            }
+        }
+        best
+    }
+}

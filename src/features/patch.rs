@@ -1,0 +1,249 @@
+//! Planes and quadrics through the points of a small neighbourhood, in units of the spacing, seen from the point in question.
+
+use glam::DVec3;
+
+use crate::points::moments::Moments;
+
+/// An unoriented plane: `normal . x = offset`.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Plane {
+    pub normal: DVec3,
+    pub offset: f64,
+}
+
+impl Plane {
+    /// The plane of least orthogonal squares.
+    pub fn through(points: impl Iterator<Item = DVec3>) -> Self {
+        let mut moments = Moments::default();
+        points.for_each(|p| moments.add(p));
+        let fit = moments.plane();
+        Self {
+            normal: fit.normal,
+            offset: fit.normal.dot(fit.centre),
+        }
+    }
+
+    /// Signed distance.
+    pub fn distance(&self, p: DVec3) -> f64 {
+        self.normal.dot(p) - self.offset
+    }
+}
+
+/// A height function of second degree over a plane, or of first where `coefficients[3..]` are zero.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Surface {
+    origin: DVec3,
+    frame: [DVec3; 3],
+    coefficients: [f64; 6],
+}
+
+/// What a fit left over.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Fit {
+    pub surface: Surface,
+    /// Sum of squared residuals, each capped.
+    pub squares: f64,
+    /// Points fitted.
+    pub count: usize,
+    /// Parameters fitted.
+    pub parameters: usize,
+}
+
+impl Fit {
+    /// Bayes' information criterion at noise of variance `variance`: smaller is better.
+    pub fn criterion(&self, variance: f64) -> f64 {
+        self.squares / variance + self.parameters as f64 * (self.count.max(2) as f64).ln()
+    }
+}
+
+impl Surface {
+    /// The plane as a surface.
+    fn flat(plane: Plane, near: DVec3) -> Self {
+        let n = plane.normal;
+        let u = n.any_orthonormal_vector();
+        Self {
+            origin: near - n * plane.distance(near),
+            frame: [u, n.cross(u), n],
+            coefficients: [0.0; 6],
+        }
+    }
+
+    fn local(&self, p: DVec3) -> [f64; 3] {
+        let d = p - self.origin;
+        self.frame.map(|axis| d.dot(axis))
+    }
+
+    /// Height of `p` above the surface along the frame's normal, and the gradient of that height.
+    pub fn height(&self, p: DVec3) -> (f64, DVec3) {
+        let [x, y, z] = self.local(p);
+        let c = &self.coefficients;
+        let h = c[0] + c[1] * x + c[2] * y + c[3] * x * x + c[4] * x * y + c[5] * y * y;
+        let hx = c[1] + 2.0 * c[3] * x + c[4] * y;
+        let hy = c[2] + c[4] * x + 2.0 * c[5] * y;
+        let [u, v, n] = self.frame;
+        (z - h, n - u * hx - v * hy)
+    }
+
+    /// Signed distance to first order.
+    pub fn distance(&self, p: DVec3) -> f64 {
+        let (h, gradient) = self.height(p);
+        h / gradient.length()
+    }
+
+    /// Whether the surface is curved.
+    pub fn is_curved(&self) -> bool {
+        self.coefficients[3..].iter().any(|c| *c != 0.0)
+    }
+}
+
+/// The better, by Bayes' criterion, of the plane and the quadric through those `points` that `member` admits.
+///
+/// `variance` is that of the noise; residuals count up to three standard deviations. `None` for fewer than three points.
+pub(super) fn fit(points: &[DVec3], variance: f64, member: impl Fn(usize) -> bool) -> Option<Fit> {
+    let mut moments = Moments::default();
+    for (_, p) in points.iter().enumerate().filter(|(i, _)| member(*i)) {
+        moments.add(*p);
+    }
+    let count = moments.count() as usize;
+    if count < 3 {
+        return None;
+    }
+    let plane = moments.plane();
+    let flat = Surface::flat(
+        Plane {
+            normal: plane.normal,
+            offset: plane.normal.dot(plane.centre),
+        },
+        plane.centre,
+    );
+    let cap = 9.0 * variance;
+    let squares = |surface: &Surface| -> f64 {
+        points
+            .iter()
+            .enumerate()
+            .filter(|(i, _)| member(*i))
+            .map(|(_, p)| surface.distance(*p).powi(2).min(cap))
+            .sum()
+    };
+    let simple = Fit {
+        surface: flat,
+        squares: squares(&flat),
+        count,
+        parameters: 3,
+    };
+    let worth_bending = simple.squares > variance * 3.0 * (count as f64).ln();
+    if count < 9 || !worth_bending {
+        return Some(simple);
+    }
+    let mut curved = flat;
+    for _ in 0..2 {
+        let Some(better) = bend(&curved, points, &member) else {
+            return Some(simple);
+        };
+        curved = better;
+    }
+    let bent = Fit {
+        surface: curved,
+        squares: squares(&curved),
+        count,
+        parameters: 6,
+    };
+    Some(if bent.criterion(variance) < simple.criterion(variance) {
+        bent
+    } else {
+        simple
+    })
+}
+
+/// Least squares of the six coefficients in the frame of `start`, each height weighted by the slope of `start` there.
+fn bend(start: &Surface, points: &[DVec3], member: &impl Fn(usize) -> bool) -> Option<Surface> {
+    let mut a = [[0.0; 6]; 6];
+    let mut b = [0.0; 6];
+    for (_, p) in points.iter().enumerate().filter(|(i, _)| member(*i)) {
+        let [x, y, z] = start.local(*p);
+        let row = [1.0, x, y, x * x, x * y, y * y];
+        let weight = 1.0 / start.height(*p).1.length_squared();
+        for i in 0..6 {
+            let w = weight * row[i];
+            b[i] += w * z;
+            for j in i..6 {
+                a[i][j] += w * row[j];
+            }
+        }
+    }
+    solve(a, b).map(|coefficients| Surface {
+        coefficients,
+        ..*start
+    })
+}
+
+/// Solves the symmetric system whose upper triangle is `a`; `None` where it is singular.
+fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
+    let scale = (0..N).map(|i| a[i][i]).fold(0.0, f64::max);
+    for k in 0..N {
+        let pivot = a[k][k];
+        if pivot.is_nan() || pivot <= 1e-10 * scale {
+            return None;
+        }
+        for i in k + 1..N {
+            let f = a[k][i] / pivot;
+            for j in i..N {
+                a[i][j] -= f * a[k][j];
+            }
+            b[i] -= f * b[k];
+        }
+    }
+    for k in (0..N).rev() {
+        let rest: f64 = (k + 1..N).map(|j| a[k][j] * b[j]).sum();
+        b[k] = (b[k] - rest) / a[k][k];
+    }
+    Some(b)
+}
+
+/// The point nearest to `start` that lies on both surfaces, and the unit tangent of their intersection there.
+///
+/// Newton's method on both heights, taking the shortest step each time; `None` where the surfaces run parallel.
+pub(super) fn foot(one: &Surface, other: &Surface, start: DVec3) -> Option<(DVec3, DVec3)> {
+    let mut at = start;
+    let mut tangent = DVec3::ZERO;
+    let rounds = if one.is_curved() || other.is_curved() {
+        6
+    } else {
+        2
+    };
+    for _ in 0..rounds {
+        let ((h1, g1), (h2, g2)) = (one.height(at), other.height(at));
+        let (h1, g1) = (h1 / g1.length(), g1.normalize());
+        let (h2, g2) = (h2 / g2.length(), g2.normalize());
+        let c = g1.dot(g2);
+        let s2 = 1.0 - c * c;
+        if s2.is_nan() || s2 < 1e-5 {
+            return None;
+        }
+        tangent = g1.cross(g2) / s2.sqrt();
+        let on_both = at - g1 * ((h1 - c * h2) / s2) - g2 * ((h2 - c * h1) / s2);
+        // Keep to the plane across the edge through the start, so that the foot is the nearest point of the curve.
+        at = on_both + tangent * tangent.dot(start - on_both);
+        if (at - start).length_squared() > 64.0 {
+            return None;
+        }
+    }
+    Some((at, tangent))
+}
+
+/// The point where three surfaces meet, near `start`.
+pub(super) fn meeting(surfaces: [&Surface; 3], start: DVec3) -> Option<DVec3> {
+    let mut at = start;
+    for _ in 0..6 {
+        let [(h0, g0), (h1, g1), (h2, g2)] = surfaces.map(|s| s.height(at));
+        let det = g0.dot(g1.cross(g2));
+        if det.is_nan() || det.abs() < 0.02 * g0.length() * g1.length() * g2.length() {
+            return None;
+        }
+        at -= (g1.cross(g2) * h0 + g2.cross(g0) * h1 + g0.cross(g1) * h2) / det;
+        if (at - start).length_squared() > 64.0 {
+            return None;
+        }
+    }
+    Some(at)
+}

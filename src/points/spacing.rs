@@ -1,0 +1,199 @@
+//! How far apart measured points lie, along and across the scan lines, and how noisy they are.
+
+use std::f64::consts::{PI, TAU};
+
+use glam::DVec3;
+use rayon::prelude::*;
+
+use super::moments::Moments;
+use super::{Neighbors, PointCloud};
+
+/// Places looked at; the medians over them are good to a few percent.
+const SAMPLES: usize = 3_000;
+/// Neighbours within which spacing is judged.
+const NEIGHBOURS: usize = 24;
+/// Neighbours among which the next scan line is sought: reaches it at 1:25.
+const FAR_NEIGHBOURS: usize = 160;
+/// Ratio of across to along from which on points count as scan lines; random samples show up to 2.6.
+const LINES_FROM: f64 = 3.4;
+
+/// Spacing of the points of a cloud; `along_mm` and `across_mm` are equal where no scan lines are seen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Spacing {
+    /// Along a scan line, mm.
+    pub along_mm: f64,
+    /// From a scan line to the next, mm.
+    pub across_mm: f64,
+    /// Square root of the area a point has to itself, mm.
+    pub mean_mm: f64,
+}
+
+impl Spacing {
+    /// Whether the points lie in lines.
+    pub fn in_lines(&self) -> bool {
+        self.across_mm > self.along_mm * 1.01
+    }
+}
+
+/// The spacing of `cloud`; all zero where it has fewer than three distinct points.
+///
+/// Median over a sample of places. Across the lines counts the radius within which a place has neighbours in every direction of
+/// its tangent plane; that holds for lattices, merged views and unorganised points alike.
+pub fn spacing(cloud: &PointCloud, neighbors: &Neighbors) -> Spacing {
+    let samples: Vec<[f64; 3]> = sample(neighbors.places())
+        .par_iter()
+        .filter_map(|&i| local_spacing(cloud, neighbors, cloud.positions[i as usize]))
+        .collect();
+    let middle = |at: usize| quantile(samples.iter().map(|s| s[at]).collect(), 0.5);
+    let (mean, along, across) = (middle(0), middle(1), middle(2));
+    if across > LINES_FROM * along {
+        Spacing {
+            along_mm: along,
+            across_mm: across,
+            mean_mm: (along * across).sqrt(),
+        }
+    } else {
+        Spacing {
+            along_mm: mean,
+            across_mm: mean,
+            mean_mm: mean,
+        }
+    }
+}
+
+/// Mean spacing, distance to the second nearest neighbour, and radius that has neighbours all around.
+fn local_spacing(cloud: &PointCloud, neighbors: &Neighbors, p: DVec3) -> Option<[f64; 3]> {
+    let mut found = Vec::new();
+    neighbors.nearest(p, FAR_NEIGHBOURS, &mut found);
+    if found.len() < 3 {
+        return None;
+    }
+    let near = found[found.len().min(NEIGHBOURS) - 1];
+    let others = (found.len().min(NEIGHBOURS) - 1) as f64;
+    let mean = (PI * near.1 / others).sqrt();
+    let mut moments = Moments::default();
+    for (i, _) in &found {
+        moments.add(cloud.positions[*i as usize] - p);
+    }
+    let plane = moments.plane();
+    let v = plane.normal.cross(plane.major);
+    let mut angles: Vec<f64> = Vec::new();
+    let mut around = found[found.len() - 1].1.sqrt();
+    for (i, d2) in found.iter().skip(1) {
+        let d = cloud.positions[*i as usize] - p;
+        angles.push(d.dot(v).atan2(d.dot(plane.major)));
+        if angles.len() > 2 && widest_gap(&mut angles) < 100f64.to_radians() {
+            around = d2.sqrt();
+            break;
+        }
+    }
+    Some([mean, found[2].1.sqrt(), around])
+}
+
+/// The widest angle, rad, between directions that follow each other around the circle; sorts them.
+pub(crate) fn widest_gap(angles: &mut [f64]) -> f64 {
+    angles.sort_unstable_by(f64::total_cmp);
+    let (Some(first), Some(last)) = (angles.first(), angles.last()) else {
+        return TAU;
+    };
+    angles
+        .windows(2)
+        .map(|w| w[1] - w[0])
+        .fold(first + TAU - last, f64::max)
+}
+
+/// Standard deviation, mm, of the points normal to the surface.
+///
+/// From residuals of local quadric fits, corrected for degrees of freedom; a low quantile over many places, so that edges, outliers and
+/// small radii do not raise it.
+pub fn noise_mm(cloud: &PointCloud, neighbors: &Neighbors, spacing: &Spacing) -> f64 {
+    const QUANTILE: f64 = 0.35;
+    const NORMAL_QUANTILE: f64 = -0.385;
+    let ratio = (spacing.across_mm / spacing.along_mm.max(f64::MIN_POSITIVE)).clamp(1.0, 20.0);
+    let k = (32.0 * (ratio / 1.5).max(1.0)) as usize;
+    let variances: Vec<(f64, f64)> = sample(neighbors.places())
+        .par_iter()
+        .filter_map(|&i| quadric_variance(cloud, neighbors, (cloud.positions[i as usize], k)))
+        .collect();
+    if variances.is_empty() {
+        return 0.0;
+    }
+    let freedom = quantile(variances.iter().map(|v| v.1).collect(), 0.5);
+    // Wilson and Hilferty: quantiles of chi-squared over its degrees of freedom.
+    let spread = 2.0 / (9.0 * freedom);
+    let expected = (1.0 - spread + NORMAL_QUANTILE * spread.sqrt()).powi(3);
+    let seen = quantile(variances.iter().map(|v| v.0).collect(), QUANTILE);
+    (seen / expected).sqrt()
+}
+
+/// Residual variance, mm², and degrees of freedom of the quadric height function through the `k` nearest places.
+fn quadric_variance(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    (p, k): (DVec3, usize),
+) -> Option<(f64, f64)> {
+    let mut found = Vec::new();
+    neighbors.nearest(p, k, &mut found);
+    if found.len() < 10 {
+        return None;
+    }
+    let mut moments = Moments::default();
+    for (i, _) in &found {
+        moments.add(cloud.positions[*i as usize] - p);
+    }
+    let plane = moments.plane();
+    let reach = found[found.len() - 1].1.sqrt();
+    let v = plane.normal.cross(plane.major);
+    let mut columns: Vec<Vec<f64>> = vec![Vec::with_capacity(found.len()); 7];
+    for (i, _) in &found {
+        let d = (cloud.positions[*i as usize] - p - plane.centre) / reach;
+        let (x, y) = (d.dot(plane.major), d.dot(v));
+        for (column, value) in
+            columns
+                .iter_mut()
+                .zip([1.0, x, y, x * x, x * y, y * y, d.dot(plane.normal)])
+        {
+            column.push(value);
+        }
+    }
+    let (rest, rank) = residual_after(columns);
+    let freedom = found.len() as f64 - rank as f64;
+    Some((rest * reach * reach / freedom, freedom))
+}
+
+/// Squared length of the last column after taking out the others (Gram and Schmidt), and the rank of those.
+fn residual_after(mut columns: Vec<Vec<f64>>) -> (f64, usize) {
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+    let mut rank = 0;
+    for c in 0..columns.len() - 1 {
+        let (done, rest) = columns.split_at_mut(c + 1);
+        let current = &done[c];
+        let length2 = dot(current, current);
+        if length2 < 1e-8 {
+            continue;
+        }
+        rank += 1;
+        for other in rest {
+            let f = dot(current, other) / length2;
+            for (o, x) in other.iter_mut().zip(current) {
+                *o -= f * x;
+            }
+        }
+    }
+    let last = &columns[columns.len() - 1];
+    (dot(last, last), rank)
+}
+
+fn sample(places: &[u32]) -> Vec<u32> {
+    let step = (places.len() / SAMPLES).max(1);
+    places.iter().copied().step_by(step).collect()
+}
+
+/// The value below which the share `q` lies; zero for no values.
+fn quantile(mut values: Vec<f64>, q: f64) -> f64 {
+    if values.is_empty() {
+        return 0.0;
+    }
+    let at = ((values.len() - 1) as f64 * q) as usize;
+    *values.select_nth_unstable_by(at, f64::total_cmp).1
+}
