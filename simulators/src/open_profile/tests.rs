@@ -452,6 +452,8 @@ fn a_paced_device_keeps_its_rate_and_drops_what_nobody_takes() {
     let wire = Wire::pty(&port("paced")).unwrap();
     let device = SimulatedProfiler::start(wire, view(1000, 400), setup).unwrap();
     let mut host = Host::open(&device);
+    // 50 profiles of 100 columns fit into the device's queue, so that none is dropped however slow this reader is
+    assert_eq!(host.set(5, 100).0, 0);
     let began = Instant::now();
     host.start(1, 50, 10_000);
     let (frames, _) = host.until_stopped();
@@ -461,8 +463,9 @@ fn a_paced_device_keeps_its_rate_and_drops_what_nobody_takes() {
         "{:?}",
         began.elapsed()
     );
-    // 64 KiB in the device and 20 in the line hold some 14 profiles; at 1 kHz the others are dropped, and counted
+    // of 1000 columns 64 KiB in the device and 20 in the line hold some 14; at 1 kHz the others are dropped, and counted
     assert_eq!(host.set(1, 1_000_000).0, 0);
+    assert_eq!(host.set(5, 1000).0, 0);
     host.start(2, 100, 10_000);
     assert!(device.wait_until(PATIENCE, |s| s.run == Some(2) && !s.streaming));
     let (frames, last) = host.until_stopped();
