@@ -2,6 +2,7 @@
 
 mod check;
 mod devices;
+mod nominal;
 
 use std::process::ExitCode;
 
@@ -12,6 +13,8 @@ pub enum Command {
     Check(check::Check),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
+    /// Show faces, edges and sharp edges of a CAD file as read, and what was refused and why.
+    Nominal(nominal::Nominals),
 }
 
 impl Command {
@@ -23,6 +26,7 @@ impl Command {
         match self {
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
+            Command::Nominal(command) => command.run(),
         }
     }
 }
