@@ -174,6 +174,16 @@ fn main() {
             seconds,
             if score.f1() >= goal { "" } else { "<" },
         );
+        if std::env::var_os("WRONG").is_some() {
+            let mut bins = [0usize; 9];
+            for (p, c) in sampled.points.iter().zip(&found.classes) {
+                let d = clouds::score::distance(&sampled.edges, *p) / sampled.spacing;
+                if clouds::score::is_edge(c) && d > 1.0 {
+                    bins[((d * 2.0) as usize).min(8)] += 1;
+                }
+            }
+            println!("    false by distance in half spacings: {bins:?}");
+        }
         if std::env::var_os("STAGES").is_some() {
             for (stage, s) in &found.seconds {
                 println!("    {stage:24} {s:.3}");
