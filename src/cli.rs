@@ -3,6 +3,7 @@
 mod check;
 mod demo;
 mod devices;
+mod nominal;
 mod progress;
 
 use std::process::ExitCode;
@@ -22,6 +23,8 @@ pub enum Command {
     Check(check::Check),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
+    /// Show faces, edges and sharp edges of a CAD file as read, and what was refused and why.
+    Nominal(nominal::Nominals),
 }
 
 impl Command {
@@ -34,6 +37,7 @@ impl Command {
             Command::Demo(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
+            Command::Nominal(command) => command.run(),
         }
     }
 }
