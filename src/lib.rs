@@ -10,6 +10,8 @@ pub mod geometry;
 
 pub mod features;
 
+pub mod surface;
+
 pub mod nominal;
 
 pub mod inspect;
@@ -19,5 +21,9 @@ pub mod report;
 pub mod acquire;
 
 pub mod config;
+
+pub mod cell;
+
+pub mod web;
 
 pub mod cli;

@@ -139,6 +139,11 @@ impl Nominal {
         self.faces.iter().map(Face::area_mm2).sum()
     }
 
+    /// Volume inside the faces, mm3: of use where the bodies are solids.
+    pub fn volume_mm3(&self) -> f64 {
+        self.faces.iter().map(Face::volume_mm3).sum()
+    }
+
     /// Length of all edges, each counted once, mm.
     pub fn edge_length_mm(&self) -> f64 {
         self.edges.iter().map(|e| e.length_mm).sum()

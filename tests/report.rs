@@ -1,9 +1,13 @@
 //! The report and its forms, read as their readers read them.
 
+#[path = "report/forms.rs"]
+mod forms;
 #[path = "report/part.rs"]
 mod part;
 #[path = "report/schema.rs"]
 mod schema;
+#[path = "report/web.rs"]
+mod web;
 
 use acies::report::Report;
 

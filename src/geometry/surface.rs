@@ -36,11 +36,11 @@ pub enum Surface {
         /// In mm.
         radius_mm: f64,
     },
-    /// u around the axis, v around the tube.
+    /// u around the axis, v around the tube. A tube wider than its ring ends at the axis.
     Torus {
         /// Axis.
         frame: Frame,
-        /// From the axis to the middle of the tube, mm.
+        /// From the axis to the middle of the tube, mm; negative for the part of a wide tube inside itself.
         major_mm: f64,
         /// Radius of the tube, mm.
         minor_mm: f64,
@@ -66,6 +66,12 @@ impl Surface {
                 Range::open(-radius_mm / half_angle_rad.tan(), f64::INFINITY),
             ],
             Self::Sphere { .. } => [Range::TURN, Range::open(-FRAC_PI_2, FRAC_PI_2)],
+            Self::Torus {
+                major_mm, minor_mm, ..
+            } if major_mm.abs() < *minor_mm => {
+                let cusp = (-major_mm / minor_mm).acos();
+                [Range::TURN, Range::open(-cusp, cusp)]
+            }
             Self::Torus { .. } => [Range::TURN; 2],
             Self::Swept(s) => s.ranges(),
             Self::Nurbs(s) => s.ranges(),
@@ -200,16 +206,11 @@ impl Surface {
             } => {
                 let l = frame.local(p);
                 let tube = DVec2::new(l.truncate().length() - major_mm, l.z);
-                let mut v = Frame::angle_of(tube);
-                // A tube wider than its ring is used for its outer part only: up to the axis.
-                if major_mm + minor_mm * v.cos() < 0.0 {
-                    let cusp = (-major_mm / minor_mm).acos();
-                    v = if l.z >= 0.0 {
-                        cusp
-                    } else {
-                        std::f64::consts::TAU - cusp
-                    };
+                if major_mm.abs() >= *minor_mm {
+                    return (Frame::angle_of(l.truncate()), Frame::angle_of(tube));
                 }
+                let cusp = (-major_mm / minor_mm).acos();
+                let v = tube.y.atan2(tube.x).clamp(-cusp, cusp);
                 (Frame::angle_of(l.truncate()), v)
             }
             Self::Swept(s) => s.nearest(p, near),

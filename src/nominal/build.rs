@@ -17,7 +17,7 @@ use crate::geometry::{Curve, Frame, RigidTransform, Surface};
 /// Faces that one nominal may have.
 const MAX_FACES: usize = 200_000;
 /// Chord of the polylines that bound a face, as a share of the edge's length.
-const CHORD: f64 = 2e-5;
+const CHORD: f64 = 8e-6;
 
 /// Reads a nominal from the text of a STEP file.
 pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
@@ -152,7 +152,7 @@ impl<'a> Builder<'a> {
             }
         }
         let is_solid = !place_is_surface(self.file, place.body);
-        let volume: f64 = self.faces[first..].iter().map(|f| f.volume_mm3).sum();
+        let volume: f64 = self.faces[first..].iter().map(Face::volume_mm3).sum();
         if is_solid && volume < 0.0 {
             self.turn_over(first, index);
         }
@@ -210,14 +210,14 @@ impl<'a> Builder<'a> {
             return Err(refuse(id, format!("a face of type {} is not read", r.name)));
         }
         let surface = cx.shapes.surface(r.reference(2)?)?;
-        // Loops run around the face's normal, which may be against the surface's.
-        let along = r.flag(3)? ^ surface.reversed;
         let mut loops = Vec::new();
         for bound in r.references(1)? {
             loops.extend(self.bound(cx, bound)?);
         }
         let shape = surface.shape.transformed(&cx.place);
-        let shape = self.used_nappe(shape, &loops);
+        let (shape, turned) = self.used_part(shape, &loops);
+        // Loops run around the face's normal, which may be against the surface's.
+        let along = r.flag(3)? ^ surface.reversed ^ turned;
         let uv = |flip: bool| -> Vec<UvLoop> {
             let lay = |l: &EdgeLoop| self.lay(&shape, l, flip);
             loops.iter().map(lay).filter(|l| l.len() > 1).collect()
@@ -250,34 +250,57 @@ impl<'a> Builder<'a> {
         Ok(())
     }
 
-    /// A cone on the side of its apex where its edges lie: files may use the far side, where the radius runs below zero.
-    fn used_nappe(&self, surface: Surface, loops: &[EdgeLoop]) -> Surface {
-        let Surface::Cone {
-            frame,
-            radius_mm,
-            half_angle_rad,
-        } = surface
-        else {
-            return surface;
-        };
-        let apex = frame.origin - frame.z * (radius_mm / half_angle_rad.tan());
-        let points = loops
-            .iter()
-            .flatten()
-            .flat_map(|(e, _)| &self.edges[*e].points);
-        let height: f64 = points.map(|p| (*p - apex).dot(frame.z)).sum();
-        if height >= 0.0 {
-            return surface;
-        }
-        Surface::Cone {
-            frame: Frame {
-                origin: apex,
-                y: -frame.y,
-                z: -frame.z,
-                ..frame
-            },
-            radius_mm: 0.0,
-            half_angle_rad,
+    /// The part of a surface crossing itself on which the edges lie, and whether its normal is then turned.
+    ///
+    /// Files may use a cone beyond its apex and a torus inside its own tube, where the radius runs below zero.
+    fn used_part(&self, surface: Surface, loops: &[EdgeLoop]) -> (Surface, bool) {
+        let edges = loops.iter().flatten();
+        let points = edges.flat_map(|(e, _)| &self.edges[*e].points);
+        match surface {
+            Surface::Cone {
+                frame,
+                radius_mm,
+                half_angle_rad,
+            } => {
+                let apex = frame.origin - frame.z * (radius_mm / half_angle_rad.tan());
+                let height: f64 = points.map(|p| (*p - apex).dot(frame.z)).sum();
+                if height >= 0.0 {
+                    return (surface, false);
+                }
+                let far_side = Surface::Cone {
+                    frame: Frame {
+                        origin: apex,
+                        y: -frame.y,
+                        z: -frame.z,
+                        ..frame
+                    },
+                    radius_mm: 0.0,
+                    half_angle_rad,
+                };
+                (far_side, false)
+            }
+            Surface::Torus {
+                frame,
+                major_mm,
+                minor_mm,
+            } if major_mm.abs() < minor_mm => {
+                let inner = Surface::Torus {
+                    frame,
+                    major_mm: -major_mm,
+                    minor_mm,
+                };
+                let miss = |s: &Surface, p: &DVec3| {
+                    let (u, v) = s.nearest(*p, None);
+                    s.point(u, v).distance(*p)
+                };
+                let lean: f64 = points.map(|p| miss(&surface, p) - miss(&inner, p)).sum();
+                if lean > 0.0 {
+                    (inner, true)
+                } else {
+                    (surface, false)
+                }
+            }
+            other => (other, false),
         }
     }
 

@@ -12,23 +12,31 @@ pub(super) fn extremes(face: &Face) -> Vec<DVec3> {
     match &face.surface {
         // The furthest point of a plane or a ruled surface is on its border.
         Surface::Plane(_) | Surface::Cylinder { .. } | Surface::Cone { .. } => Vec::new(),
-        Surface::Sphere { frame, radius_mm } => both
-            .map(|d| frame.origin + d * *radius_mm)
-            .filter(|p| face.contains(face.surface.nearest(*p, None)))
-            .collect(),
+        Surface::Sphere { frame, radius_mm } => {
+            used(face, both.map(|d| frame.origin + d * *radius_mm))
+        }
         Surface::Torus {
             frame,
             major_mm,
             minor_mm,
-        } => both
-            .map(|d| {
+        } => {
+            let outermost = both.map(|d| {
                 let across = (d - frame.z * d.dot(frame.z)).normalize_or(frame.x);
                 frame.origin + across * *major_mm + d * *minor_mm
-            })
-            .filter(|p| face.contains(face.surface.nearest(*p, None)))
-            .collect(),
+            });
+            used(face, outermost)
+        }
         Surface::Nurbs(_) | Surface::Swept(_) => sampled(face),
     }
+}
+
+/// The points of the surface nearest to some, where they lie inside the face.
+fn used(face: &Face, points: impl Iterator<Item = DVec3>) -> Vec<DVec3> {
+    points
+        .map(|p| face.surface.nearest(p, None))
+        .filter(|uv| face.contains(*uv))
+        .map(|(u, v)| face.surface.point(u, v))
+        .collect()
 }
 
 /// A grid over the face, fine enough that what bulges between its points is a thousandth of its size.

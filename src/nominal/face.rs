@@ -19,8 +19,7 @@ pub struct Face {
     /// Whether the surface's own normal points out of the material.
     pub(super) outward: bool,
     area_mm2: f64,
-    /// Share of the face in the volume of its body: the integral of p . n / 3.
-    pub(super) volume_mm3: f64,
+    volume_mm3: f64,
 }
 
 /// A point of a face.
@@ -93,6 +92,11 @@ impl Face {
     /// In mm2.
     pub fn area_mm2(&self) -> f64 {
         self.area_mm2
+    }
+
+    /// Share of the face in the volume of its body, mm3: the integral of p . n / 3 over it.
+    pub fn volume_mm3(&self) -> f64 {
+        self.volume_mm3
     }
 
     /// The point at parameters.

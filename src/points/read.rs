@@ -268,7 +268,6 @@ mod tests {
                 continue;
             }
             let got = read(&path, Unit::Millimetre).unwrap();
-            println!("{name}: {} {:?}", got.cloud.len(), got.findings);
             assert_eq!((got.format, got.cloud.len()), (format, points), "{name}");
         }
     }

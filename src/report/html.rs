@@ -239,7 +239,7 @@ fn write_view(out: &mut String, drawing: &Drawing<'_>) -> fmt::Result {
     drawing.write_svg(out)?;
     writeln!(
         out,
-        "</div>\n<p class=\"small soft print-only\">Hair lines show the deviations × {}.</p>\n\
+        "</div>\n<p class=\"small soft\" id=\"view-factor\">Hair lines show the deviations × {}.</p>\n\
          <div class=\"tools live\" id=\"view-tools\" hidden>\
          <button type=\"button\" data-view=\"home\">Home</button><button type=\"button\" data-view=\"front\">Front</button>\
          <button type=\"button\" data-view=\"side\">Side</button><button type=\"button\" data-view=\"top\">Top</button>\
@@ -250,15 +250,17 @@ fn write_view(out: &mut String, drawing: &Drawing<'_>) -> fmt::Result {
     )?;
     out.write_str("<ul class=\"legend drawing-legend\">")?;
     for (state, name) in [
-        ("ok", "OK"),
-        ("not_ok", "NOT OK: thick"),
-        ("not_decidable", "NOT DECIDABLE: dashed"),
-        ("undefined", "not judged"),
-        ("gap", "not measured: dotted"),
+        ("run s-ok", "OK"),
+        ("run s-not_ok", "NOT OK: thick"),
+        ("run s-not_decidable", "NOT DECIDABLE: dashed"),
+        ("run s-undefined", "not judged"),
+        ("run s-gap", "not measured: dotted"),
+        ("hair", "deviation, enlarged"),
+        ("extra", "not in the nominal: red, dotted"),
     ] {
         write!(
             out,
-            "<li><svg class=\"drawing\" viewBox=\"0 0 44 12\" aria-hidden=\"true\"><path class=\"run s-{state}\" d=\"M3 6H41\"/></svg>{name}</li>"
+            "<li><svg class=\"drawing\" viewBox=\"0 0 44 12\" aria-hidden=\"true\"><path class=\"{state}\" d=\"M3 6H41\"/></svg>{name}</li>"
         )?;
     }
     out.write_str("</ul></section>\n")
@@ -266,7 +268,7 @@ fn write_view(out: &mut String, drawing: &Drawing<'_>) -> fmt::Result {
 
 fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::Result {
     out.write_str("<section class=\"card\"><h2>Each edge</h2>\n<p class=\"small soft\">Line: deviation. Band around it: ± U. \
-         Tinted stripe between dashed lines: within the limits. Hatched: not measured. Diamond: the worst place.</p>\n")?;
+         Tinted stripe: within the limits; dashed lines: the limits, value at the right. Hatched: not measured. Diamond: the worst place.</p>\n")?;
     for (index, (edge, shown)) in report.edges.iter().zip(shown).enumerate() {
         writeln!(
             out,
@@ -283,6 +285,9 @@ fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::
         out.write_str("<div class=\"plots\">")?;
         plot::write(out, edge, Quantity::D1, shown)?;
         plot::write(out, edge, Quantity::D2, shown)?;
+        if angle_matters(edge) {
+            plot::write(out, edge, Quantity::AngleDeviation, shown)?;
+        }
         out.write_str("</div>")?;
         if shown.len() < edge.stations.len() {
             write!(
@@ -295,6 +300,13 @@ fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::
         out.write_str("</section>\n")?;
     }
     out.write_str("</section>\n")
+}
+
+/// The angle is plotted where it keeps the edge from being OK.
+fn angle_matters(edge: &Edge) -> bool {
+    edge.characteristics
+        .iter()
+        .any(|c| c.quantity == Quantity::AngleDeviation && c.verdict > Status::Ok)
 }
 
 /// Where along the edge something was not measured or not decidable, and why.

@@ -186,3 +186,226 @@ impl Decoder {
         self.held.drain(..n);
     }
 }
+
+/// The examples of the document's section 8: name and bytes.
+#[cfg(test)]
+pub(super) fn examples() -> Vec<(&'static str, Vec<u8>)> {
+    let document = include_str!("../../open-profile.md");
+    let (_, section) = document
+        .split_once("## 8. Examples")
+        .expect("the document has a section of examples");
+    let quoted = |line: &'static str| line.trim().trim_start_matches("- ").split('`').nth(1);
+    let lines: Vec<&str> = section.lines().filter(|line| line.contains('`')).collect();
+    let pairs = lines.chunks_exact(2);
+    pairs
+        .map(|pair| {
+            let name = quoted(pair[0]).expect("a name in back ticks");
+            let hex = quoted(pair[1]).expect("bytes in back ticks");
+            let bytes = hex.split(' ').map(|b| u8::from_str_radix(b, 16));
+            (name, bytes.collect::<Result<_, _>>().expect("hex bytes"))
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// Type, id and payload of a frame.
+    type Parts = (u8, u32, Vec<u8>);
+
+    /// Every frame that comes out, and the errors.
+    fn decode(decoder: &mut Decoder, bytes: &[u8]) -> (Vec<Parts>, Vec<DecodeError>) {
+        let (mut frames, mut errors) = (Vec::new(), Vec::new());
+        decoder.take(bytes, |frame| match frame {
+            Ok(frame) => frames.push((frame.kind, frame.id, frame.payload.to_vec())),
+            Err(error) => errors.push(error),
+        });
+        (frames, errors)
+    }
+
+    fn stream() -> Vec<u8> {
+        examples()
+            .into_iter()
+            .flat_map(|(_, bytes)| bytes)
+            .collect()
+    }
+
+    #[test]
+    fn check_value_of_the_document() {
+        assert_eq!(CRC.checksum(b"123456789"), 0xE306_9283);
+    }
+
+    #[test]
+    fn every_example_is_one_whole_frame() {
+        let examples = examples();
+        assert_eq!(examples.len(), 14);
+        for (name, bytes) in examples {
+            let Step::Frame(frame, used) = step(&bytes) else {
+                panic!("{name} is no frame");
+            };
+            assert_eq!(used, bytes.len(), "{name}");
+            assert_eq!(encode(frame.kind, frame.id, frame.payload), bytes, "{name}");
+        }
+    }
+
+    #[test]
+    fn split_at_every_byte() {
+        let stream = stream();
+        let (whole, errors) = decode(&mut Decoder::default(), &stream);
+        assert_eq!((whole.len(), errors), (14, Vec::new()));
+        for cut in 0..=stream.len() {
+            let mut decoder = Decoder::default();
+            let mut parts = decode(&mut decoder, &stream[..cut]).0;
+            parts.extend(decode(&mut decoder, &stream[cut..]).0);
+            assert_eq!(parts, whole, "cut at {cut}");
+            assert_eq!((decoder.skipped_bytes(), decoder.held_bytes()), (0, 0));
+        }
+        let mut decoder = Decoder::default();
+        let single: Vec<_> = stream
+            .iter()
+            .flat_map(|&byte| decode(&mut decoder, &[byte]).0)
+            .collect();
+        assert_eq!(single, whole);
+    }
+
+    #[test]
+    fn garbage_between_frames_is_counted() {
+        let garbage = [0xA5, 0xA5, 0x00, 0x5A, 0xFF, 0xA5];
+        let mut stream = garbage.to_vec();
+        for (_, bytes) in examples() {
+            stream.extend(bytes);
+            stream.extend(garbage);
+        }
+        let mut decoder = Decoder::default();
+        let (frames, errors) = decode(&mut decoder, &stream);
+        assert_eq!((frames.len(), errors.len()), (14, 0));
+        // The last byte may begin a magic and is still held.
+        assert_eq!(decoder.skipped_bytes(), 15 * 6 - 1);
+        assert_eq!(decoder.held_bytes(), 1);
+        decoder.stalled(|_| panic!("one byte is no frame"));
+        assert_eq!((decoder.skipped_bytes(), decoder.held_bytes()), (90, 0));
+    }
+
+    #[test]
+    fn one_lost_byte_costs_one_frame() {
+        let (first, second) = (&examples()[7].1, &examples()[8].1);
+        for lost in 0..first.len() {
+            let mut stream = first.clone();
+            stream.remove(lost);
+            let damaged = stream.len() as u64;
+            stream.extend(second);
+            stream.extend(second);
+            let mut decoder = Decoder::default();
+            let (frames, _) = decode(&mut decoder, &stream);
+            let ids: Vec<u32> = frames.iter().map(|frame| frame.1).collect();
+            assert_eq!(ids, [1, 1], "byte {lost} lost");
+            assert_eq!(decoder.skipped_bytes(), damaged, "byte {lost} lost");
+        }
+    }
+
+    #[test]
+    fn one_flipped_bit_costs_one_frame() {
+        let (first, second) = (&examples()[7].1, &examples()[8].1);
+        for bit in 0..8 * first.len() {
+            let mut stream = first.clone();
+            stream[bit / 8] ^= 1 << (bit % 8);
+            stream.extend(second);
+            let (frames, _) = decode(&mut Decoder::default(), &stream);
+            assert_eq!(frames.len(), 1, "bit {bit}");
+            assert_eq!(frames[0].1, 1, "bit {bit}");
+        }
+    }
+
+    #[test]
+    fn a_lying_length_with_a_good_header_check_hides_nothing() {
+        let (first, second) = (&examples()[7].1, &examples()[8].1);
+        let mut liar = first.clone();
+        liar[8..12].copy_from_slice(&100_u32.to_le_bytes());
+        let check = CRC.checksum(&liar[..12]).to_le_bytes();
+        liar[12..16].copy_from_slice(&check);
+        let mut stream = liar.clone();
+        stream.extend(second);
+        let mut decoder = Decoder::default();
+        let (frames, errors) = decode(&mut decoder, &stream);
+        assert_eq!(frames.len(), 1, "the frame inside the claimed length");
+        assert_eq!(decoder.skipped_bytes(), liar.len() as u64);
+        assert!(matches!(
+            errors[0],
+            DecodeError::FrameCheck { length: 100, .. }
+        ));
+    }
+
+    #[test]
+    fn errors_say_what_was_seen() {
+        let hello = examples()[0].1.clone();
+        let told = |bytes: &[u8]| match step(bytes) {
+            Step::Bad(error) => error.to_string(),
+            other => panic!("{other:?}"),
+        };
+        let mut header = hello.clone();
+        header[12] ^= 1;
+        assert_eq!(
+            told(&header),
+            "header check is 0xfb90535b, the bytes give 0xfb90535a"
+        );
+        let mut body = hello.clone();
+        body[16] ^= 0xFF;
+        assert_eq!(
+            told(&body),
+            "frame check is 0x48674b38, the bytes give 0x48674bc7 (payload of 0 bytes)"
+        );
+        let with_check = |mut bytes: Vec<u8>| {
+            let check = CRC.checksum(&bytes[..12]).to_le_bytes();
+            bytes[12..16].copy_from_slice(&check);
+            let check = CRC.checksum(&bytes[..16]).to_le_bytes();
+            bytes[16..].copy_from_slice(&check);
+            bytes
+        };
+        let mut long = hello.clone();
+        long[8..12].copy_from_slice(&65_537_u32.to_le_bytes());
+        assert_eq!(
+            told(&with_check(long)),
+            "frame says 65537 bytes, at most 65536 are allowed"
+        );
+        let mut newer = hello;
+        newer[2] = 2;
+        assert_eq!(
+            told(&with_check(newer)),
+            "protocol version 2, this program knows 1; update the one that is older"
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn any_frames_in_any_pieces_come_out(
+            frames in prop::collection::vec((any::<u8>(), any::<u32>(), prop::collection::vec(any::<u8>(), 0..300)), 0..8),
+            piece in 1_usize..400,
+        ) {
+            let stream: Vec<u8> = frames.iter().flat_map(|(kind, id, payload)| encode(*kind, *id, payload)).collect();
+            let mut decoder = Decoder::default();
+            let found: Vec<_> = stream.chunks(piece).flat_map(|part| decode(&mut decoder, part).0).collect();
+            prop_assert_eq!(found, frames);
+            prop_assert_eq!(decoder.skipped_bytes(), 0);
+        }
+
+        #[test]
+        fn any_bytes_are_consumed_or_held(
+            bytes in prop::collection::vec(prop_oneof![Just(0xA5_u8), Just(0x5A), Just(1), any::<u8>()], 0..2000),
+            piece in 1_usize..400,
+        ) {
+            let mut decoder = Decoder::default();
+            for part in bytes.chunks(piece) {
+                decoder.take(part, |_| {});
+                prop_assert!(decoder.held_bytes() <= HEADER + PAYLOAD_MAX + TRAILER);
+            }
+            let before = decoder.skipped_bytes();
+            let held = decoder.held_bytes() as u64;
+            decoder.stalled(|_| {});
+            prop_assert_eq!(decoder.held_bytes(), 0);
+            prop_assert!(decoder.skipped_bytes() <= before + held);
+        }
+    }
+}

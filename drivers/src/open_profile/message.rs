@@ -542,3 +542,217 @@ pub fn status_text(status: u16) -> &'static str {
         _ => "a status this program does not know",
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::frame::{Step, examples, step};
+    use super::*;
+
+    fn example(name: &str) -> Vec<u8> {
+        let found = examples().into_iter().find(|(n, _)| *n == name);
+        found.expect("an example of that name").1
+    }
+
+    fn frame(bytes: &[u8]) -> Frame<'_> {
+        match step(bytes) {
+            Step::Frame(frame, _) => frame,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn reply(name: &str) -> (u32, Reply) {
+        let bytes = example(name);
+        let frame = frame(&bytes);
+        match message(&frame) {
+            Ok(Message::Reply(reply)) => (frame.id, reply),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn commands_are_the_documents_bytes() {
+        let set_rate = Command::Set {
+            key: Key::Rate,
+            value: 500_000,
+        };
+        let start = Command::Start {
+            run: 7,
+            count: 0,
+            keepalive_ms: 500,
+        };
+        let keepalive = Command::Keepalive {
+            host_time_ns: 1_000_000,
+        };
+        assert_eq!(Command::Hello.encode(1), example("hello"));
+        assert_eq!(set_rate.encode(2), example("set-rate"));
+        assert_eq!(start.encode(4), example("start"));
+        assert_eq!(keepalive.encode(5), example("keepalive"));
+        assert_eq!(Command::Stop.encode(6), example("stop"));
+    }
+
+    #[test]
+    fn replies_of_the_document() {
+        let identity = Identity {
+            boot: 0xC0FF_EE01,
+            columns_max: 640,
+            rate_max: 2_000_000,
+            capabilities: 0b1_0111,
+            near_um: 60_000,
+            far_um: 140_000,
+            width_um: 90_000,
+            vendor: "Acies".into(),
+            model: "open-1".into(),
+            serial: "P-0042".into(),
+            firmware: "1.0.0".into(),
+        };
+        assert!(identity.has_encoder() && identity.has_laser_switch());
+        assert_eq!(reply("identity"), (1, Reply::Identity(identity)));
+        let rate = Value {
+            status: 0,
+            key: 1,
+            value: 500_000,
+            minimum: 1000,
+            maximum: 2_000_000,
+        };
+        assert_eq!(reply("value-rate"), (2, Reply::Value(rate)));
+        let columns = Value {
+            status: 2,
+            key: 5,
+            value: 640,
+            minimum: 1,
+            maximum: 640,
+        };
+        assert_eq!(reply("set-refused"), (3, Reply::Value(columns)));
+        let started = Reply::Started {
+            status: 0,
+            run: 7,
+            boot: 0xC0FF_EE01,
+        };
+        assert_eq!(reply("started"), (4, started));
+        let alive = Reply::Alive {
+            boot: 0xC0FF_EE01,
+            flags: 1,
+        };
+        assert_eq!(reply("alive"), (5, alive));
+        let stopped = Stopped {
+            reason: 0,
+            run: 7,
+            sent: 2,
+            dropped: 3,
+        };
+        assert_eq!(reply("stopped"), (6, Reply::Stopped(stopped)));
+        let refused = Reply::Refused {
+            status: 5,
+            text: "type 0x42?".into(),
+        };
+        assert_eq!(reply("refused"), (9, refused));
+    }
+
+    fn capture(name: &str) -> (u32, Profile) {
+        let bytes = example(name);
+        let host_time = Instant::now();
+        match message(&frame(&bytes)) {
+            Ok(Message::Profile(raw)) => (raw.run, raw.capture(true, host_time)),
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn profiles_of_the_document() {
+        let (run, profile) = capture("profile-implicit");
+        assert_eq!((run, profile.sequence, profile.boot), (7, 0, 0xC0FF_EE01));
+        assert_eq!(profile.device_time_ns, 1_500_000);
+        assert_eq!((profile.encoder, profile.dropped), (Some(-3), 0));
+        assert_eq!(profile.x_mm, [-15.0, -5.0, 5.0, 15.0]);
+        assert_eq!(profile.z_mm[..2], [100.0, 100.002]);
+        assert!(profile.z_mm[2].is_nan() && !profile.saturated);
+        assert_eq!(profile.z_mm[3], 99.998);
+        assert!(profile.intensity.is_empty());
+
+        let (_, profile) = capture("profile-explicit");
+        assert_eq!((profile.sequence, profile.dropped), (1, 3));
+        assert_eq!(profile.x_mm, [-1.25, 1.25]);
+        assert_eq!(profile.z_mm, [80.5, 80.75]);
+        assert_eq!(profile.intensity, [1000, 65_535]);
+        assert_eq!(profile.encoder, Some(400));
+        assert!(profile.saturated);
+    }
+
+    #[test]
+    fn a_profile_without_an_encoder_has_none() {
+        let bytes = example("profile-implicit");
+        let Ok(Message::Profile(raw)) = message(&frame(&bytes)) else {
+            panic!("no profile");
+        };
+        assert_eq!(raw.capture(false, Instant::now()).encoder, None);
+    }
+
+    fn told(kind: u8, payload: &[u8]) -> String {
+        let frame = Frame {
+            kind,
+            id: 0,
+            payload,
+        };
+        message(&frame).expect_err("a bad payload").to_string()
+    }
+
+    #[test]
+    fn every_payload_cut_short_is_refused_and_a_longer_one_taken() {
+        for (name, bytes) in examples() {
+            let whole = frame(&bytes);
+            if whole.kind < 0x80 {
+                assert!(message(&whole).is_err(), "{name} is not for the host");
+                continue;
+            }
+            for length in 0..whole.payload.len() {
+                let payload = &whole.payload[..length];
+                let cut = Frame { payload, ..whole };
+                let error = message(&cut).expect_err(name);
+                assert!(
+                    matches!(error, DecodeError::TooShort { found, needed, .. } if found == length && needed > length),
+                    "{name} cut to {length}: {error}"
+                );
+            }
+            let mut longer = whole.payload.to_vec();
+            longer.extend([0xEE; 9]);
+            let payload = longer.as_slice();
+            assert_eq!(message(&Frame { payload, ..whole }), message(&whole));
+        }
+    }
+
+    #[test]
+    fn errors_say_what_was_seen() {
+        assert_eq!(
+            told(0x42, &[]),
+            "message type 0x42 is not one a device sends"
+        );
+        assert_eq!(told(0x84, &[0; 5]), "STARTED has 5 bytes, needs 6");
+        assert_eq!(
+            told(0x90, &[59, 0, 0, 0]),
+            "header_length of PROFILE is 59, allowed is 60 or more"
+        );
+        assert_eq!(
+            told(0x9F, &[5, 0, 1, 0, 0xFF]),
+            "text of REFUSED is not UTF-8"
+        );
+        // 65535 columns of all three kinds do not fit in any frame.
+        let mut profile = vec![0; 60];
+        profile[..4].copy_from_slice(&[60, 0, 0xFF, 0xFF]);
+        profile[34] = 7;
+        assert_eq!(told(0x90, &profile), "PROFILE has 60 bytes, needs 262200");
+    }
+
+    #[test]
+    fn a_longer_profile_header_is_skipped() {
+        let bytes = example("profile-implicit");
+        let whole = frame(&bytes);
+        let mut payload = whole.payload.to_vec();
+        payload[0] = 64;
+        payload.splice(60..60, [0xEE; 4]);
+        let longer = Frame {
+            payload: &payload,
+            ..whole
+        };
+        assert_eq!(message(&longer), message(&whole));
+    }
+}

@@ -3,28 +3,31 @@
 use std::fmt::{self, Write};
 
 use super::page::class;
+use crate::report::characteristic::sample;
 use crate::report::figure::{COVERAGE_FACTOR, Figure};
 use crate::report::wire::{Characteristic, Edge, Quantity, Status};
 
 const WIDTH: f64 = 480.0;
 const HEIGHT: f64 = 190.0;
 const LEFT: f64 = 50.0;
-const RIGHT: f64 = 8.0;
+const RIGHT: f64 = 44.0;
 const TOP: f64 = 12.0;
 const BOTTOM: f64 = 34.0;
 
-/// A station in the units of the plot: mm along, µm up.
+/// A station in the units of the plot: mm along, µm or degrees up.
 struct Dot {
     s_mm: f64,
     /// Value and expanded uncertainty; `None` = not measured.
     seen: Option<(f64, f64)>,
 }
 
-/// Where mm and µm lie on the paper.
+/// Where places and values lie on the paper.
 struct Axes {
     length_mm: f64,
-    low_um: f64,
-    high_um: f64,
+    low: f64,
+    high: f64,
+    /// From the unit of the wire to the one people read: mm to µm, degrees as they are.
+    scale: f64,
 }
 
 impl Axes {
@@ -32,86 +35,89 @@ impl Axes {
         LEFT + (WIDTH - LEFT - RIGHT) * s_mm / self.length_mm
     }
 
-    fn y(&self, um: f64) -> f64 {
-        TOP + (HEIGHT - TOP - BOTTOM) * (self.high_um - um) / (self.high_um - self.low_um)
+    fn y(&self, value: f64) -> f64 {
+        TOP + (HEIGHT - TOP - BOTTOM) * (self.high - value) / (self.high - self.low)
     }
 
     /// The part of the axis that shows `[low, high]`.
-    fn band(&self, low_um: f64, high_um: f64) -> (f64, f64) {
-        let (top, bottom) = (
-            self.y(high_um.min(self.high_um)),
-            self.y(low_um.max(self.low_um)),
-        );
+    fn band(&self, low: f64, high: f64) -> (f64, f64) {
+        let (top, bottom) = (self.y(high.min(self.high)), self.y(low.max(self.low)));
         (top, (bottom - top).max(0.0))
     }
 }
 
-/// Writes the plot of d1 or d2; `shown` are the stations to draw.
+/// Writes the plot of one quantity; `shown` are the stations to draw.
 pub fn write(out: &mut String, edge: &Edge, quantity: Quantity, shown: &[usize]) -> fmt::Result {
     let Some(characteristic) = edge.characteristics.iter().find(|c| c.quantity == quantity) else {
         return Ok(());
     };
-    let dots = dots(edge, quantity, shown);
-    let axes = axes(edge, &dots, characteristic);
+    let scale = match quantity {
+        Quantity::D1 | Quantity::D2 => 1e3,
+        Quantity::AngleDeviation => 1.0,
+    };
+    let dots = dots(edge, (quantity, scale), shown);
+    let axes = axes(edge, (&dots, scale), characteristic);
     writeln!(
         out,
         r#"<figure><svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{}">"#,
         super::page::Escaped(&spoken(edge, characteristic))
     )?;
-    write_limits(out, &axes, characteristic)?;
+    write_within(out, &axes, characteristic)?;
     write_grid(out, &axes)?;
+    write_limits(out, &axes, characteristic)?;
     write_holes(out, &axes, &dots)?;
     write_band(out, &axes, &dots)?;
     write_line(out, &axes, &dots)?;
     write_worst(out, &axes, characteristic)?;
-    let name = if quantity == Quantity::D1 { "d1" } else { "d2" };
+    let caption = match quantity {
+        Quantity::D1 => "d1, µm, along n1",
+        Quantity::D2 => "d2, µm, along n2",
+        Quantity::AngleDeviation => "included angle minus nominal, °",
+    };
     writeln!(
         out,
-        r#"<text class="x" x="{:.0}" y="{:.0}">arc length, mm</text></svg><figcaption>{name}, µm, along n{}</figcaption></figure>"#,
+        r#"<text class="x" x="{:.0}" y="{:.0}">arc length, mm</text></svg><figcaption>{caption}</figcaption></figure>"#,
         (WIDTH + LEFT - RIGHT) / 2.0,
-        HEIGHT - 3.0,
-        &name[1..]
+        HEIGHT - 3.0
     )
 }
 
-fn dots(edge: &Edge, quantity: Quantity, shown: &[usize]) -> Vec<Dot> {
+fn dots(edge: &Edge, (quantity, scale): (Quantity, f64), shown: &[usize]) -> Vec<Dot> {
     shown
         .iter()
-        .map(|&index| {
-            let station = &edge.stations[index];
-            let (d_mm, u_mm) = match quantity {
-                Quantity::D1 => (station.d1_mm, station.u_d1_mm),
-                _ => (station.d2_mm, station.u_d2_mm),
-            };
-            Dot {
-                s_mm: station.s_mm,
-                seen: d_mm.map(|d| (d * 1e3, COVERAGE_FACTOR * u_mm.unwrap_or(0.0) * 1e3)),
-            }
+        .map(|&index| Dot {
+            s_mm: edge.stations[index].s_mm,
+            seen: sample(&edge.stations[index], quantity).map(|seen| {
+                let expanded = COVERAGE_FACTOR * seen.u.unwrap_or(0.0);
+                (seen.value * scale, expanded * scale)
+            }),
         })
         .collect()
 }
 
 /// Axes that hold every value with its U, zero, and the limits unless these are much farther out than the values.
-fn axes(edge: &Edge, dots: &[Dot], characteristic: &Characteristic) -> Axes {
+fn axes(edge: &Edge, (dots, scale): (&[Dot], f64), characteristic: &Characteristic) -> Axes {
     let seen = || dots.iter().filter_map(|dot| dot.seen);
-    let mut low = seen().map(|(d, u)| d - u).fold(-1.0, f64::min);
-    let mut high = seen().map(|(d, u)| d + u).fold(1.0, f64::max);
+    // At least 1 µm or 0.001 degrees, so that values of zero still have an axis.
+    let mut low = seen().map(|(d, u)| d - u).fold(-1e-3 * scale, f64::min);
+    let mut high = seen().map(|(d, u)| d + u).fold(1e-3 * scale, f64::max);
     let reach = 8.0 * high.max(-low);
     for limit in [characteristic.lower, characteristic.upper]
         .into_iter()
         .flatten()
-        .map(|limit| limit * 1e3)
+        .map(|limit| limit * scale)
         .filter(|limit| limit.abs() <= reach)
     {
         low = low.min(limit);
         high = high.max(limit);
     }
-    let margin = 0.09 * (high - low);
+    let margin = 0.1 * (high - low);
     let last = edge.stations.last().map_or(0.0, |station| station.s_mm);
     Axes {
         length_mm: edge.length_mm.unwrap_or(last).max(last).max(1e-6),
-        low_um: low - margin,
-        high_um: high + margin,
+        low: low - margin,
+        high: high + margin,
+        scale,
     }
 }
 
@@ -125,26 +131,35 @@ fn spoken(edge: &Edge, characteristic: &Characteristic) -> String {
     )
 }
 
-fn write_limits(out: &mut String, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
+/// The stripe within the limits.
+fn write_within(out: &mut String, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
     let (Some(lower), Some(upper)) = (characteristic.lower, characteristic.upper) else {
         return Ok(());
     };
-    let (x0, x1) = (axes.x(0.0), axes.x(axes.length_mm));
-    let (top, height) = axes.band(lower * 1e3, upper * 1e3);
+    let (top, height) = axes.band(lower * axes.scale, upper * axes.scale);
     writeln!(
         out,
-        r#"<rect class="within" x="{x0:.1}" y="{top:.1}" width="{:.1}" height="{height:.1}"/>"#,
-        x1 - x0
-    )?;
-    for (limit_mm, dy) in [(upper, -4.0), (lower, 12.0)] {
-        let um = limit_mm * 1e3;
-        if (axes.low_um..=axes.high_um).contains(&um) {
-            let y = axes.y(um);
+        r#"<rect class="within" x="{LEFT:.1}" y="{top:.1}" width="{:.1}" height="{height:.1}"/>"#,
+        WIDTH - LEFT - RIGHT
+    )
+}
+
+/// A dashed line a limit, its value at the right.
+fn write_limits(out: &mut String, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
+    let x1 = WIDTH - RIGHT;
+    for limit in [characteristic.upper, characteristic.lower]
+        .into_iter()
+        .flatten()
+    {
+        let value = limit * axes.scale;
+        if (axes.low..=axes.high).contains(&value) {
+            let y = axes.y(value);
             writeln!(
                 out,
-                r#"<path class="limit" d="M{x0:.1} {y:.1}H{x1:.1}"/><text class="limit-name y" x="{x1:.1}" y="{:.1}">limit {}</text>"#,
-                y + dy,
-                Figure::of(characteristic.quantity, limit_mm, None).value
+                r#"<path class="limit" d="M{LEFT:.1} {y:.1}H{x1:.1}"/><text class="limit-name" x="{:.1}" y="{:.1}">{}</text>"#,
+                x1 + 5.0,
+                y + 4.0,
+                Figure::of(characteristic.quantity, limit, None).value
             )?;
         }
     }
@@ -153,13 +168,13 @@ fn write_limits(out: &mut String, axes: &Axes, characteristic: &Characteristic) 
 
 fn write_grid(out: &mut String, axes: &Axes) -> fmt::Result {
     let (x0, x1) = (axes.x(0.0), axes.x(axes.length_mm));
-    let step = nice_step((axes.high_um - axes.low_um) / 4.0);
-    let first = (axes.low_um / step).ceil() as i64;
-    let last = (axes.high_um / step).floor() as i64;
+    let step = nice_step((axes.high - axes.low) / 4.0);
+    let first = (axes.low / step).ceil() as i64;
+    let last = (axes.high / step).floor() as i64;
     for tick in first..=last {
-        let (um, y) = (tick as f64 * step, axes.y(tick as f64 * step));
+        let y = axes.y(tick as f64 * step);
         let class = if tick == 0 { "zero" } else { "grid" };
-        let label = tick_label(um, step);
+        let label = tick_label(tick as f64 * step, step);
         writeln!(
             out,
             r#"<path class="{class}" d="M{x0:.1} {y:.1}H{x1:.1}"/><text class="y" x="{:.1}" y="{:.1}">{label}</text>"#,
@@ -294,16 +309,17 @@ fn write_worst(out: &mut String, axes: &Axes, characteristic: &Characteristic) -
             HEIGHT / 2.0
         );
     };
-    let (x, y) = (axes.x(s_mm), axes.y(value * 1e3));
+    let (x, y) = (axes.x(s_mm), axes.y(value * axes.scale));
     let status = match characteristic.verdict {
         Status::Undefined => "undefined",
         verdict => class(verdict),
     };
     let figure = Figure::of(characteristic.quantity, value, characteristic.u);
-    let name_y = if y < TOP + 26.0 { y + 20.0 } else { y - 10.0 };
+    let below = y < TOP + 26.0 || (value < 0.0 && y < HEIGHT - BOTTOM - 24.0);
+    let name_y = if below { y + 20.0 } else { y - 10.0 };
     let anchor = match x {
         x if x < LEFT + 50.0 => "start",
-        x if x > WIDTH - 60.0 => "end",
+        x if x > WIDTH - RIGHT - 30.0 => "end",
         _ => "middle",
     };
     writeln!(

@@ -14,6 +14,7 @@
   canvas.className = 'live';
   box.prepend(canvas);
   drawing.setAttribute('hidden', '');
+  document.getElementById('view-factor').hidden = true;
   const tools = document.getElementById('view-tools');
   tools.hidden = false;
   const readout = document.getElementById('view-readout');
@@ -36,9 +37,15 @@
     return [cy * x + sy * y, cp * z + sp * away, cp * away - sp * z];
   }
 
+  // Half the width and height of the part from its centre, as first shown: at zoom 1 it fills the canvas.
+  const reach = data.edges.flatMap(edge => edge.xyz).reduce((most, p) => {
+    const [right, up] = seen(...p.map((v, i) => v - data.centre[i]));
+    return [Math.max(most[0], Math.abs(right)), Math.max(most[1], Math.abs(up))];
+  }, [1e-9, 1e-9]);
+
   function projection() {
     const w = canvas.clientWidth, h = canvas.clientHeight, c = data.centre;
-    const k = eye.zoom * 0.8 * Math.min(w, h * 1.25) / (2 * data.radius);
+    const k = eye.zoom * Math.min((w / 2 - 36) / reach[0], (h / 2 - 36) / reach[1]);
     return (x, y, z) => {
       const [right, up, away] = seen(x - c[0], y - c[1], z - c[2]);
       return [w / 2 + k * right, h / 2 - k * up, away];
@@ -101,8 +108,9 @@
     pen.setLineDash([]);
     pen.font = '700 14px system-ui, sans-serif'; pen.textAlign = 'center';
     labels.forEach(([edge, p]) => {
-      pen.strokeStyle = card; pen.lineWidth = 4; pen.strokeText(edge.id, p[0], p[1] - 8);
-      pen.fillStyle = ink; pen.fillText(edge.id, p[0], p[1] - 8);
+      pen.strokeStyle = card; pen.lineWidth = 4; pen.strokeText(edge.name, p[0], p[1] - 8);
+      pen.fillStyle = colour(edge.verdict === 'undefined' ? 'line' : edge.verdict);
+      pen.fillText(edge.name, p[0], p[1] - 8);
     });
     pen.textAlign = 'start';
     drawAxes(colour('soft'));
