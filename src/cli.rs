@@ -3,6 +3,7 @@
 mod check;
 mod demo;
 mod devices;
+mod inspect;
 mod progress;
 
 use std::process::ExitCode;
@@ -20,6 +21,8 @@ pub enum Command {
     Demo(demo::Demo),
     /// Say everything that is wrong with a cell's configuration, touching no device.
     Check(check::Check),
+    /// Measure every sharp edge of a scan against its CAD model.
+    Inspect(inspect::Inspect),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
 }
@@ -34,6 +37,7 @@ impl Command {
             Command::Demo(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
+            Command::Inspect(command) => command.run(),
         }
     }
 }
