@@ -3,7 +3,7 @@
 mod check;
 mod demo;
 mod devices;
-mod nominal;
+mod inspect;
 mod progress;
 
 use std::process::ExitCode;
@@ -21,10 +21,10 @@ pub enum Command {
     Demo(demo::Demo),
     /// Say everything that is wrong with a cell's configuration, touching no device.
     Check(check::Check),
+    /// Measure every sharp edge of a scan against its CAD model.
+    Inspect(inspect::Inspect),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
-    /// Show faces, edges and sharp edges of a CAD file as read, and what was refused and why.
-    Nominal(nominal::Nominals),
 }
 
 impl Command {
@@ -37,7 +37,7 @@ impl Command {
             Command::Demo(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
-            Command::Nominal(command) => command.run(),
+            Command::Inspect(command) => command.run(),
         }
     }
 }
