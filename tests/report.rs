@@ -1,9 +1,13 @@
 //! The report and its forms, read as their readers read them.
 
+#[path = "report/forms.rs"]
+mod forms;
 #[path = "report/part.rs"]
 mod part;
 #[path = "report/schema.rs"]
 mod schema;
+#[path = "report/web.rs"]
+mod web;
 
 use acies::report::Report;
 
@@ -114,4 +118,24 @@ fn the_schema_is_the_one_that_was_published() {
         "the wire types no longer give tests/acies-report-1.schema.json; a change of the contract is a new version, \
          an added key is written with UPDATE=1"
     );
+}
+
+#[test]
+fn a_page_of_fifty_edges_stays_below_one_and_a_half_megabytes() {
+    let mut inspection = part::inspection(100);
+    let edges = inspection.edges.clone();
+    inspection.edges = edges.iter().cycle().take(50).cloned().collect();
+    let page = Report::new(&inspection, &part::facts()).to_html();
+    assert!(page.len() < 1_500_000, "{} bytes", page.len());
+    let edges = edges.iter().cycle().take(600).cloned().collect();
+    inspection.edges = edges;
+    let page = Report::new(&inspection, &part::facts()).to_html();
+    assert!(page.len() < 6_000_000, "{} bytes for 600 edges", page.len());
+}
+
+#[test]
+fn the_page_is_kept_for_people_to_look_at() {
+    let path = concat!(env!("CARGO_TARGET_TMPDIR"), "/report.html");
+    std::fs::write(path, report().to_html()).expect("the target folder can be written");
+    assert!(std::fs::metadata(path).expect("it was written").len() > 10_000);
 }

@@ -9,6 +9,7 @@
 mod transition;
 mod variance;
 
+use super::clusters::{Clusters, NO_GROUP};
 use crate::geometry::fit::{LinearFit, fit_robust};
 
 /// Points of one flank in the coordinates of its edge, in order of arc length.
@@ -25,7 +26,7 @@ pub struct FlankPoints {
 }
 
 /// The scan line of a point of which nothing but its coordinates is known.
-pub const NO_LINE: u32 = u32::MAX;
+pub const NO_LINE: u32 = NO_GROUP;
 
 /// One point for [`FlankPoints::new`]: (s, r, deviation, line).
 pub type FlankPoint = (f64, f64, f64, u32);
@@ -33,7 +34,10 @@ pub type FlankPoint = (f64, f64, f64, u32);
 impl FlankPoints {
     /// Sorts the points along the edge.
     pub fn new(mut points: Vec<FlankPoint>) -> Self {
-        points.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1)));
+        points.sort_by(|a, b| {
+            let by_place = a.0.total_cmp(&b.0).then(a.1.total_cmp(&b.1));
+            by_place.then(a.2.total_cmp(&b.2)).then(a.3.cmp(&b.3))
+        });
         let mut flank = Self::default();
         for (s, r, deviation, line) in points {
             flank.s.push(s);
@@ -122,6 +126,9 @@ pub struct FlankSeries {
     pub reach_mm: f64,
     /// Whether the model needed a term in r squared.
     pub bent: bool,
+    /// Variance of the mean offset over the stations, over what it would be if stations shared nothing. They share scan
+    /// lines that run along the edge, and form deviation.
+    pub shared_factor: f64,
 }
 
 /// Measures one flank at every station of its edge.
@@ -171,8 +178,8 @@ struct WindowFit<const P: usize> {
     fit: LinearFit<P>,
     sigma: f64,
     cut_mm: f64,
-    lines: variance::Clusters<P>,
-    cells: variance::Clusters<P>,
+    lines: Clusters<P>,
+    cells: Clusters<P>,
 }
 
 type Series<const P: usize> = Vec<Result<WindowFit<P>, FlankGap>>;
@@ -254,8 +261,8 @@ fn fit_window<const P: usize>(
     let residual = |k: usize| values[k] - robust.fit.predict(&rows[k]);
     let sample = |k: &usize, group: u32| (group, rows[*k], residual(*k));
     Ok(WindowFit {
-        lines: variance::Clusters::new(kept.iter().map(|k| sample(k, line(*k))), &robust.fit),
-        cells: variance::Clusters::new(kept.iter().map(|k| sample(k, cell(*k))), &robust.fit),
+        lines: Clusters::new(kept.iter().map(|k| sample(k, line(*k))), &robust.fit),
+        cells: Clusters::new(kept.iter().map(|k| sample(k, cell(*k))), &robust.fit),
         fit: robust.fit,
         sigma: robust.sigma,
         cut_mm: range.cut_mm,
@@ -315,6 +322,7 @@ fn finish<const P: usize, const Q: usize>(
 ) -> FlankSeries {
     let noise = variance::estimate(&series);
     let form = variance::form_factors(&series, richer, &noise);
+    let shared_factor = variance::shared_factor(&series, &noise, &form);
     let stations = series
         .into_iter()
         .zip(noise.iter().zip(form))
@@ -336,6 +344,7 @@ fn finish<const P: usize, const Q: usize>(
         stations,
         reach_mm: settings.reach_mm,
         bent,
+        shared_factor,
     }
 }
 

@@ -1,7 +1,7 @@
 //! Values along an edge put together: spread, worst station, verdict against limits.
 
-use super::Rule;
 use super::wire::{Characteristic, Quantity, Spread, Station, Status};
+use crate::inspect::recipe::Rule;
 
 /// One quantity of one station, in the unit of the wire.
 #[derive(Debug, Clone, Copy)]
@@ -23,9 +23,9 @@ pub struct Criterion {
     pub rule: Rule,
 }
 
-/// The measured values of `quantity` along the edge, in order.
-pub fn samples(stations: &[Station], quantity: Quantity) -> Vec<Sample> {
-    let pick = |station: &Station| match quantity {
+/// `quantity` at one station; `None` where it was not measured.
+pub fn sample(station: &Station, quantity: Quantity) -> Option<Sample> {
+    let (value, u) = match quantity {
         Quantity::D1 => (station.d1_mm, station.u_d1_mm),
         Quantity::D2 => (station.d2_mm, station.u_d2_mm),
         Quantity::AngleDeviation => (
@@ -35,16 +35,18 @@ pub fn samples(stations: &[Station], quantity: Quantity) -> Vec<Sample> {
             station.u_included_angle_deg,
         ),
     };
+    value.map(|value| Sample {
+        s_mm: station.s_mm,
+        value,
+        u,
+    })
+}
+
+/// The measured values of `quantity` along the edge, in order.
+pub fn samples(stations: &[Station], quantity: Quantity) -> Vec<Sample> {
     stations
         .iter()
-        .filter_map(|station| {
-            let (value, u) = pick(station);
-            value.map(|value| Sample {
-                s_mm: station.s_mm,
-                value,
-                u,
-            })
-        })
+        .filter_map(|station| sample(station, quantity))
         .collect()
 }
 
@@ -58,8 +60,8 @@ pub fn judge(value: f64, u: Option<f64>, criterion: Criterion) -> Status {
     };
     let zone = match (criterion.rule, u) {
         (Rule::Simple, _) => 0.0,
-        (Rule::GuardBand { k }, Some(u)) => k * u,
-        (Rule::GuardBand { .. }, None) => return Status::NotDecidable,
+        (Rule::GuardBand(k), Some(u)) => k * u,
+        (Rule::GuardBand(_), None) => return Status::NotDecidable,
     };
     if value - zone > upper || value + zone < lower {
         Status::NotOk
@@ -136,7 +138,7 @@ mod tests {
         Criterion { limits, rule }
     }
 
-    const BAND: Rule = Rule::GuardBand { k: 2.0 };
+    const BAND: Rule = Rule::GuardBand(2.0);
 
     #[test]
     fn the_guard_band_splits_the_line_into_five() {

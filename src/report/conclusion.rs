@@ -101,9 +101,10 @@ fn ok(report: &Report) -> (String, String) {
         .max_by(|a, b| used_share(a.1).total_cmp(&used_share(b.1)));
     let reason = match tightest {
         Some((edge, characteristic)) => format!(
-            "all {judged} values are within their limits; nearest to one is {}: {}",
+            "all {judged} values are within their limits; nearest to one is {}, where {}{}",
             edge.id,
-            stated(characteristic)
+            stated(characteristic),
+            limits(characteristic)
         ),
         None => "nothing is outside its limits".to_owned(),
     };
@@ -170,41 +171,47 @@ fn used_share(characteristic: &Characteristic) -> f64 {
 }
 
 fn outside(characteristic: &Characteristic) -> String {
-    format!("{}, outside its limits", stated(characteristic))
+    format!(
+        "{}, outside its limits{}",
+        stated(characteristic),
+        limits(characteristic)
+    )
 }
 
 fn inside_zone(characteristic: &Characteristic) -> String {
     format!(
-        "{}: a limit lies inside the uncertainty",
-        stated(characteristic)
+        "{}; a limit lies inside this uncertainty{}",
+        stated(characteristic),
+        limits(characteristic)
     )
 }
 
-/// `d1 is +152 µm (U 12 µm, k = 2) at 12.4 mm along the edge, limits -100 to +100 µm`.
+/// ` (−100 to +100 µm)`.
+fn limits(characteristic: &Characteristic) -> String {
+    let figure = |limit| Figure::of(characteristic.quantity, limit, None);
+    match (characteristic.lower, characteristic.upper) {
+        (Some(lower), Some(upper)) => {
+            format!(
+                " ({} to {})",
+                figure(lower).value,
+                figure(upper).with_unit()
+            )
+        }
+        _ => String::new(),
+    }
+}
+
+/// `d1 is +152 µm (U 12 µm) at 12.4 mm along the edge`.
 pub fn stated(characteristic: &Characteristic) -> String {
+    let name = quantity_name(characteristic.quantity);
     let Some(value) = characteristic.value else {
-        return format!(
-            "{} was not measured",
-            quantity_name(characteristic.quantity)
-        );
+        return format!("{name} was not measured");
     };
     let figure = Figure::of(characteristic.quantity, value, characteristic.u);
     let place = characteristic
         .s_mm
         .map_or_else(String::new, |s| format!(" at {s:.1} mm along the edge"));
-    let limits = match (characteristic.lower, characteristic.upper) {
-        (Some(lower), Some(upper)) => format!(
-            ", limits {} to {}",
-            Figure::of(characteristic.quantity, lower, None).value,
-            Figure::of(characteristic.quantity, upper, None).with_unit()
-        ),
-        _ => String::new(),
-    };
-    format!(
-        "{} is {}{place}{limits}",
-        quantity_name(characteristic.quantity),
-        figure.with_uncertainty()
-    )
+    format!("{name} is {}{place}", figure.with_uncertainty())
 }
 
 /// What people call the quantity.

@@ -1,13 +1,13 @@
 //! A made-up inspection of a part with straight, concave, circular and wavy edges, as realistic as its numbers need to be.
 
-use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::time::{Duration, UNIX_EPOCH};
 
 use acies::geometry::RigidTransform;
+use acies::inspect::recipe::{Limits, Recipe, Rule};
 use acies::inspect::result::{Alignment, EdgeResult, Inspection, Measured, StationResult, Verdict};
 use acies::nominal::{EdgeKind, Station};
-use acies::report::{DeviceFacts, EdgeLimits, Facts, LimitFacts, Rule, ScanFacts};
+use acies::report::{DeviceFacts, Facts, ScanFacts};
 use acies_drivers::device::{Identity, Losses};
 use glam::{DQuat, DVec3};
 
@@ -274,14 +274,48 @@ pub fn facts() -> Facts {
                 losses: None,
             },
         ],
-        limits: LimitFacts {
-            rule: Rule::GuardBand { k: 2.0 },
-            all: EdgeLimits {
-                d1_mm: Some([-LIMIT_MM, LIMIT_MM]),
-                d2_mm: Some([-LIMIT_MM, LIMIT_MM]),
-                angle_deviation_rad: Some([-1f64.to_radians(), 1f64.to_radians()]),
+        recipe: Recipe {
+            rule: Rule::GuardBand(2.0),
+            limits: Limits {
+                d_mm: [Some([-LIMIT_MM, LIMIT_MM]); 2],
+                angle_rad: Some([-1f64.to_radians(), 1f64.to_radians()]),
             },
-            by_edge: BTreeMap::new(),
+            ..Recipe::default()
         },
+    }
+}
+
+/// Puts `bad` in the place of a number: 1 to 8 a measured value of the first edge, the others elsewhere.
+pub fn spoil(
+    inspection: &mut Inspection,
+    facts: &mut Facts,
+    (place, station): (usize, usize),
+    bad: f64,
+) {
+    let edge = &mut inspection.edges[0];
+    let result = &mut edge.stations[station];
+    let measured = result
+        .measured
+        .as_mut()
+        .expect("the first edge is measured everywhere");
+    match place {
+        1 => measured.point.x = bad,
+        2 | 3 => measured.d_mm[place - 2] = bad,
+        4 | 5 => measured.u_d_mm[place - 4] = bad,
+        6 => measured.included_angle_rad = bad,
+        7 => measured.u_included_angle_rad = bad,
+        8 => measured.d_mm = [bad; 2],
+        9 => measured.residual_mm = [bad; 2],
+        10 => result.station.s_mm = bad,
+        11 => result.station.point.y = bad,
+        12 => result.station.normals[1].z = bad,
+        13 => edge.length_mm = bad,
+        14 => edge.coverage = bad,
+        15 => inspection.alignment.rms_mm = bad,
+        16 => inspection.alignment.covariance[2][3] = bad,
+        17 => inspection.alignment.part_from_machine.translation.x = bad,
+        18 => inspection.unexpected_edges[0][1].z = bad,
+        19 => facts.scan.noise_mm = Some(bad),
+        _ => facts.recipe.limits.d_mm[0] = Some([-bad, bad]),
     }
 }

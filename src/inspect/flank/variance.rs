@@ -6,114 +6,11 @@
 
 use std::collections::BTreeMap;
 
-use super::{NO_LINE, Series, WindowFit};
-use crate::geometry::fit::LinearFit;
-
-/// Standard deviations above its expectation at which a component is believed.
-const SIGNIFICANT: f64 = 3.0;
+use super::{Series, WindowFit};
+use crate::inspect::clusters::{Clusters, SIGNIFICANT, product};
 
 /// Weight of the neighbouring stations' noise against the station's own, in degrees of freedom.
 const PRIOR_FREEDOM: f64 = 30.0;
-
-/// Moments of the residuals of one fit, grouped.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Clusters<const P: usize> {
-    /// Sum over the groups of (sum of residuals)^2 / n.
-    between: f64,
-    /// Sum of squared residuals.
-    total: f64,
-    /// Expectation of `between` for white noise of unit variance, and for a group component of unit variance.
-    between_of: [f64; 2],
-    /// The same of `total`.
-    total_of: [f64; 2],
-    /// Sum over the groups of s s', s the sum of the group's rows.
-    scatter: [[f64; P]; P],
-}
-
-impl<const P: usize> Clusters<P> {
-    /// Groups `samples` (group, row, residual) of `fit`.
-    pub(super) fn new(
-        samples: impl Iterator<Item = (u32, [f64; P], f64)>,
-        fit: &LinearFit<P>,
-    ) -> Self {
-        let mut groups: BTreeMap<u32, (f64, [f64; P], f64)> = BTreeMap::new();
-        let (mut total, mut n) = (0.0, 0.0);
-        for (group, row, residual) in samples {
-            let entry = groups.entry(group).or_insert((0.0, [0.0; P], 0.0));
-            entry.0 += 1.0;
-            for (sum, x) in entry.1.iter_mut().zip(row) {
-                *sum += x;
-            }
-            entry.2 += residual;
-            total += residual * residual;
-            n += 1.0;
-        }
-        groups.remove(&NO_LINE);
-        let groups: Vec<(f64, [f64; P], f64)> = groups.into_values().collect();
-        Self::from_sums(&groups, (n, total), fit)
-    }
-
-    fn from_sums(groups: &[(f64, [f64; P], f64)], all: (f64, f64), fit: &LinearFit<P>) -> Self {
-        let (n, total) = all;
-        let mut clusters = Self {
-            between: 0.0,
-            total,
-            between_of: [0.0; 2],
-            total_of: [n - P as f64, 0.0],
-            scatter: [[0.0; P]; P],
-        };
-        for (count, sum, residual) in groups {
-            clusters.between += residual * residual / count;
-            clusters.between_of[0] += 1.0 - fit.leverage(sum) / count;
-            clusters.total_of[1] += count - fit.leverage(sum);
-            for i in 0..P {
-                for j in 0..P {
-                    clusters.scatter[i][j] += sum[i] * sum[j];
-                }
-            }
-        }
-        for (g, (count_g, sum_g, _)) in groups.iter().enumerate() {
-            for (h, (count_h, sum_h, _)) in groups.iter().enumerate() {
-                let own = if g == h { *count_g } else { 0.0 };
-                let shared = own - product(sum_h, &fit.cofactor, sum_g);
-                clusters.between_of[1] += shared * shared / count_h;
-            }
-        }
-        clusters
-    }
-
-    fn merge(&mut self, other: &Self) {
-        self.between += other.between;
-        self.total += other.total;
-        for k in 0..2 {
-            self.between_of[k] += other.between_of[k];
-            self.total_of[k] += other.total_of[k];
-        }
-    }
-
-    /// (white variance, group variance) where the group component is significant.
-    fn components(&self) -> Option<(f64, f64)> {
-        let [b0, b1] = self.between_of;
-        let [t0, t1] = self.total_of;
-        let determinant = b1 * t0 - b0 * t1;
-        if b0 < 1.0 || determinant <= 1e-9 * b1 * t0 {
-            return None;
-        }
-        let white = (self.total * b1 - self.between * t1) / determinant;
-        let group = (self.between * t0 - self.total * b0) / determinant;
-        if white <= 0.0 || group <= 0.0 {
-            return None;
-        }
-        let excess = self.between / white - b0;
-        (excess > SIGNIFICANT * (2.0 * b0).sqrt()).then_some((white, group))
-    }
-}
-
-fn product<const P: usize>(a: &[f64; P], matrix: &[[f64; P]; P], b: &[f64; P]) -> f64 {
-    (0..P)
-        .map(|i| a[i] * (0..P).map(|j| matrix[i][j] * b[j]).sum::<f64>())
-        .sum()
-}
 
 /// The noise at one station.
 #[derive(Debug, Clone, Copy, Default)]
@@ -168,7 +65,7 @@ pub(super) fn pooled<'a, const P: usize>(windows: impl Iterator<Item = &'a Windo
     for window in windows {
         match &mut cells {
             Some(sum) => sum.merge(&window.cells),
-            None => cells = Some(window.cells),
+            None => cells = Some(window.cells.clone()),
         }
         let own = (window.fit.used - P) as f64;
         square += own * window.sigma.powi(2);
@@ -191,7 +88,7 @@ pub(super) fn estimate<const P: usize>(series: &Series<P>) -> Vec<Noise> {
     for window in series.iter().flatten() {
         match &mut lines {
             Some(sum) => sum.merge(&window.lines),
-            None => lines = Some(window.lines),
+            None => lines = Some(window.lines.clone()),
         }
     }
     let line = lines.and_then(|l| l.components()).map_or(0.0, |c| c.1);
@@ -273,4 +170,37 @@ fn form_variance<'a>(differences: impl Iterator<Item = &'a (f64, f64, f64)>) -> 
         count + 2.0 * SIGNIFICANT * (2.0f64 * count).sqrt()
     };
     if chi > limit { excess / count } else { 0.0 }
+}
+
+/// Stations over which form deviation is taken to be one and the same: those that it is judged over.
+const FORM_LENGTH: f64 = 5.0;
+
+/// Variance of the mean offset over the stations, over what it would be if they shared nothing.
+pub(super) fn shared_factor<const P: usize>(
+    series: &Series<P>,
+    noise: &[Noise],
+    form: &[f64],
+) -> f64 {
+    let (mut alone, mut shared) = (0.0, 0.0);
+    let mut lines: BTreeMap<u32, f64> = BTreeMap::new();
+    for ((window, noise), form) in series.iter().zip(noise).zip(form) {
+        let Ok(window) = window else { continue };
+        let total = noise.full(window)[0][0];
+        let white = noise.white * window.fit.cofactor[0][0];
+        let own_lines: f64 = window.lines.influence.iter().map(|(_, w)| w * w).sum();
+        // Lines and cells overlap; what is no line is form.
+        let local = (total - white - noise.line * own_lines).max(0.0) + total * (form - 1.0);
+        alone += total * form;
+        shared += white + FORM_LENGTH * local;
+        for (line, weight) in &window.lines.influence {
+            *lines.entry(*line).or_insert(0.0) += weight;
+        }
+    }
+    let line: f64 = noise.iter().map(|n| n.line).fold(0.0, f64::max);
+    shared += line * lines.values().map(|w| w * w).sum::<f64>();
+    if alone > 0.0 {
+        (shared / alone).max(1.0)
+    } else {
+        1.0
+    }
 }
