@@ -10,6 +10,8 @@ pub mod geometry;
 
 pub mod features;
 
+pub mod surface;
+
 pub mod nominal;
 
 pub mod inspect;
@@ -19,6 +21,8 @@ pub mod report;
 pub mod acquire;
 
 pub mod config;
+
+pub mod cell;
 
 pub mod web;
 

@@ -105,7 +105,8 @@ fn unknown_keys_wrong_units_and_wrong_types_are_told_together() {
             "cell.toml: name: nothing, expected a text",
             "cell.toml:1: nmae: an unknown key, expected one of name, part, stage, device",
             "cell.toml:4: part: nominal: no file absent.step, expected a file that exists",
-            "cell.toml:12: stage: end_count: string \"60 mm\", expected a whole number",
+            "cell.toml:12: stage: end_count: \"60 mm\", expected a whole number of -1000000000000 to \
+             1000000000000",
             "cell.toml:11: stage: travel_mm_per_count: 1000 mm a count, expected a length of 1e-7 to 10 mm a count",
             "cell.toml:19: device \"left\": columns: 0, expected a whole number of 1 to 32768",
             "cell.toml:18: device \"left\": rate_khz: an unknown key, expected one of baud, port, usb_serial, \

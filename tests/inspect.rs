@@ -3,14 +3,28 @@
 #[path = "inspect/solids.rs"]
 mod solids;
 
+use acies::geometry::RigidTransform;
+use acies::geometry::fit::invert_spd;
+use acies::inspect::align::{AlignOptions, Aligned, Scan, Start, Touch, align};
 use acies::inspect::assign::Surface;
 use acies::inspect::body::Body;
 use acies::inspect::measure::{MeasureSettings, MeasuredEdge, measure_edges};
-use acies::points::PointCloud;
+use acies::inspect::result::Verdict;
+use acies::points::{Frame, Neighbors, PointCloud};
 use glam::{DVec2, DVec3};
 use solids::{ACROSS, ALONG, Made, Noise, Solid};
 
 const SIGMA: f64 = 0.010;
+
+/// An L.
+const ANGLE_PROFILE: [(f64, f64); 6] = [
+    (0.0, 0.0),
+    (20.0, 0.0),
+    (20.0, 8.0),
+    (8.0, 8.0),
+    (8.0, 16.0),
+    (0.0, 16.0),
+];
 
 const SETTINGS: MeasureSettings = MeasureSettings {
     along_mm: ALONG,
@@ -163,15 +177,7 @@ fn edges_of_a_cuboid_are_measured_honestly() {
 #[test]
 fn a_wedge_and_a_concave_edge_are_measured_honestly() {
     let wedge = [(0.0, 0.0), (20.0, 0.0), (0.0, 12.0)].map(DVec2::from);
-    let angle = [
-        (0.0, 0.0),
-        (20.0, 0.0),
-        (20.0, 8.0),
-        (8.0, 8.0),
-        (8.0, 16.0),
-        (0.0, 16.0),
-    ]
-    .map(DVec2::from);
+    let angle = ANGLE_PROFILE.map(DVec2::from);
     for (name, outline) in [("wedge", &wedge[..]), ("angle profile", &angle[..])] {
         let mut scores = Scores::default();
         for seed in 1..=4 {
@@ -225,4 +231,195 @@ fn an_edge_with_one_flank_seen_is_a_boundary() {
         }
         assert!(result.mean.is_none());
     }
+}
+
+// ---- alignment ----
+
+fn align_scan(solid: &Solid, cloud: &PointCloud, start: Start, options: &AlignOptions) -> Aligned {
+    let neighbors = Neighbors::new(&cloud.positions);
+    let spacing = acies::points::spacing(cloud, &neighbors);
+    let scan = Scan {
+        cloud,
+        neighbors: &neighbors,
+        spacing,
+        noise_mm: acies::points::noise_mm(cloud, &neighbors, &spacing),
+    };
+    align(&scan, &Surface::new(solid), start, options)
+}
+
+/// Squared Mahalanobis length of the pose error: chi-square with 6 degrees of freedom where the covariance is honest.
+fn mahalanobis(aligned: &Aligned, truth: &RigidTransform) -> f64 {
+    let error = aligned.alignment.part_from_machine * truth.inverse();
+    let turn = error.rotation.to_scaled_axis();
+    let v = [
+        turn.x,
+        turn.y,
+        turn.z,
+        error.translation.x,
+        error.translation.y,
+        error.translation.z,
+    ];
+    let inverse = invert_spd(&aligned.alignment.covariance).expect("a covariance");
+    (0..6)
+        .map(|i| v[i] * (0..6).map(|j| inverse[i][j] * v[j]).sum::<f64>())
+        .sum()
+}
+
+fn moved(cloud: &PointCloud, machine_from_part: &RigidTransform) -> PointCloud {
+    cloud.map(
+        Frame::Machine,
+        |p| machine_from_part.point(p),
+        |v| machine_from_part.vector(v),
+    )
+}
+
+#[test]
+fn a_rough_start_is_refined_to_within_its_covariance() {
+    let (mut exact, mut made) = (0.0, 0.0);
+    const SEEDS: u64 = 12;
+    for seed in 1..=SEEDS {
+        for with_deviations in [false, true] {
+            let mut noise = Noise(seed);
+            let mut solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
+            let datums = [1, 2, 3];
+            if with_deviations {
+                make(&mut solid, &mut noise);
+                for d in datums {
+                    solid.made[d as usize] = Made::default();
+                }
+            }
+            let machine_from_part = noise.motion(0.2, 2.0);
+            let cloud = moved(
+                &solid.scan(&[1, 2, 3, 4, 5, 6, 7], SIGMA, &mut noise),
+                &machine_from_part,
+            );
+            let start = noise.motion(0.15, 1.0) * machine_from_part.inverse();
+            let options = AlignOptions {
+                datum_faces: if with_deviations { &datums } else { &[] },
+                touches: &[],
+            };
+            let aligned = align_scan(&solid, &cloud, Start::Rough(start), &options);
+            assert_eq!(
+                aligned.alignment.status,
+                Verdict::Ok,
+                "{:?}",
+                aligned.findings
+            );
+            let squared = mahalanobis(&aligned, &machine_from_part.inverse());
+            println!(
+                "seed {seed}, datums {with_deviations}: chi-square {squared:.2}, rms {:.4}",
+                aligned.alignment.rms_mm
+            );
+            if with_deviations {
+                made += squared
+            } else {
+                exact += squared
+            }
+        }
+    }
+    // Mean of 12 chi-squares of 6 degrees of freedom: 6, standard deviation 1; 4 of them.
+    let n = SEEDS as f64;
+    println!(
+        "mean chi-square: all faces {:.2}, datums {:.2}",
+        exact / n,
+        made / n
+    );
+    assert!((2.0..10.0).contains(&(exact / n)), "{}", exact / n);
+    assert!((2.0..10.0).contains(&(made / n)), "{}", made / n);
+}
+
+#[test]
+fn faces_that_depart_widen_the_covariance() {
+    let mut sum = 0.0;
+    for seed in 1..=12 {
+        let mut noise = Noise(seed);
+        let mut solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
+        make(&mut solid, &mut noise);
+        let cloud = solid.scan(&[0, 1, 2, 3, 4, 5, 6, 7], SIGMA, &mut noise);
+        let start = noise.motion(0.1, 1.0);
+        let aligned = align_scan(
+            &solid,
+            &cloud,
+            Start::Rough(start),
+            &AlignOptions::default(),
+        );
+        let squared = mahalanobis(&aligned, &RigidTransform::IDENTITY);
+        println!(
+            "seed {seed}: {squared:.2} rms {:.3}",
+            aligned.alignment.rms_mm
+        );
+        sum += squared;
+    }
+    println!("mean {:.2}", sum / 12.0);
+    assert!(sum / 12.0 < 18.0);
+}
+
+#[test]
+fn a_cylinder_may_turn_and_that_is_said() {
+    let mut noise = Noise(5);
+    let solid = Solid::cylinder(8.0, 12.0);
+    let cloud = solid.scan(&[1, 2], SIGMA, &mut noise);
+    let aligned = align_scan(
+        &solid,
+        &cloud,
+        Start::Rough(noise.motion(0.1, 0.5)),
+        &AlignOptions::default(),
+    );
+    assert_eq!(aligned.alignment.weak_directions, ["rotation about z"]);
+    assert_eq!(
+        aligned.alignment.status,
+        Verdict::Ok,
+        "no edge moves: {:?}",
+        aligned.findings
+    );
+    let side = align_scan(
+        &solid,
+        &solid.scan(&[2], SIGMA, &mut noise),
+        Start::Rough(noise.motion(0.02, 0.2)),
+        &AlignOptions::default(),
+    );
+    assert_eq!(
+        side.alignment.weak_directions,
+        ["along z", "rotation about z"]
+    );
+    assert_eq!(side.alignment.status, Verdict::NotDecidable);
+    assert!(
+        side.findings[0].contains("which moves edge e1"),
+        "{:?}",
+        side.findings
+    );
+}
+
+#[test]
+fn touches_hold_what_the_scan_does_not() {
+    let mut noise = Noise(6);
+    let solid = Solid::cuboid(20.0, 14.0, 10.0);
+    let cloud = solid.scan(&[1], SIGMA, &mut noise);
+    let touch = |x: f64, y: f64, z: f64| Touch {
+        point: DVec3::new(x, y, z),
+        u_mm: 0.002,
+    };
+    let touches = [
+        touch(0.0, 7.0, 5.0),
+        touch(4.0, 0.0, 5.0),
+        touch(16.0, 0.0, 5.0),
+    ];
+    let without = align_scan(
+        &solid,
+        &cloud,
+        Start::Rough(RigidTransform::IDENTITY),
+        &AlignOptions::default(),
+    );
+    assert_eq!(without.alignment.status, Verdict::NotDecidable);
+    let options = AlignOptions {
+        datum_faces: &[],
+        touches: &touches,
+    };
+    let start = noise.motion(0.02, 0.3);
+    let with = align_scan(&solid, &cloud, Start::Rough(start), &options);
+    assert_eq!(with.alignment.status, Verdict::Ok, "{:?}", with.findings);
+    let squared = mahalanobis(&with, &RigidTransform::IDENTITY);
+    println!("touches: {squared:.2}");
+    // 0.999 quantile of chi-square with 6 degrees of freedom.
+    assert!(squared < 22.5, "{squared}");
 }

@@ -12,8 +12,11 @@ pub struct Driver {
     /// What it is, for people.
     pub summary: &'static str,
     /// Checks one `[[device]]` table without its `name` and `driver`. No effects; all mistakes at once.
-    pub configure: fn(toml::Table) -> Result<Box<dyn Setup>, Vec<Mistake>>,
+    pub configure: fn(toml::Table) -> Configured,
 }
+
+/// A checked configuration, or everything wrong with it.
+pub type Configured = Result<Box<dyn Setup>, Vec<Mistake>>;
 
 /// Something wrong in a configuration table.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

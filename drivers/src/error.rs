@@ -314,7 +314,7 @@ pub enum DeviceError {
     },
     /// The probe met nothing on its way.
     #[error(
-        "{port}: no contact between {start_mm:?} and {target_mm:?} mm; check that the part lies there and the probe is wired"
+        "{port}: no contact between {start_mm:?} and {target_mm:?} mm; check that the part lies there and the probe is wired, then reopen with `unlock_on_open = true` or send $X"
     )]
     NoContact {
         /// Port or address.

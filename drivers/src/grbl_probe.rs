@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::capture::Touch;
-use crate::device::{Claim, Driver, Identity, Instrument, Mistake, Probe, Setup};
+use crate::device::{Claim, Configured, Driver, Identity, Instrument, Probe, Setup};
 use crate::error::{DeviceError, LinkError};
 use crate::link::{Link, Links, Target};
 use crate::settings::Keys;
@@ -70,7 +70,7 @@ struct Motion {
     limits_mm: Option<[[f64; 3]; 2]>,
 }
 
-fn configure(table: toml::Table) -> Result<Box<dyn Setup>, Vec<Mistake>> {
+fn configure(table: toml::Table) -> Configured {
     let mut keys = Keys::new(table);
     let target = keys.target(BAUD);
     let build_info = keys.text("build_info");
@@ -467,10 +467,10 @@ impl GrblProbe {
             if !asked.iter().all(|x| x.is_finite()) {
                 return Err(refuse(asked, "finite numbers".into()));
             }
-            if let Some([least, most]) = self.motion.limits_mm {
-                if (0..3).any(|axis| !(least[axis]..=most[axis]).contains(&asked[axis])) {
-                    return Err(refuse(asked, format!("{least:?} to {most:?} mm")));
-                }
+            if let Some([least, most]) = self.motion.limits_mm
+                && (0..3).any(|axis| !(least[axis]..=most[axis]).contains(&asked[axis]))
+            {
+                return Err(refuse(asked, format!("{least:?} to {most:?} mm")));
             }
         }
         let way = [0, 1, 2].map(|axis| target_mm[axis] - start_mm[axis]);

@@ -13,7 +13,7 @@ pub mod error;
 pub mod grbl_probe;
 pub mod link;
 pub mod open_profile;
-mod settings;
+pub mod settings;
 
 /// Every driver, in the order shown to people.
 pub static ALL: &[device::Driver] = &[open_profile::DRIVER, grbl_probe::DRIVER];

@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Driver, Identity, Instrument, Losses, Mistake, Profiler, Setup};
+use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
 use crate::error::{DecodeError, DeviceError};
 use crate::link::{Link, Links, Target};
 use crate::settings::Keys;
@@ -67,7 +67,7 @@ struct Wanted {
     rounds: bool,
 }
 
-fn configure(table: toml::Table) -> Result<Box<dyn Setup>, Vec<Mistake>> {
+fn configure(table: toml::Table) -> Configured {
     let mut keys = Keys::new(table);
     let target = keys.target(BAUD);
     let serial_number = keys.text("serial_number");

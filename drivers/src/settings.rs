@@ -1,7 +1,7 @@
-//! One device table of a configuration, read key by key, so that all its mistakes are told at once.
+//! One table of a configuration, read key by key, so that all its mistakes are told at once.
 //!
-//! A derived reader stops at the first wrong key. Here every key that a driver asks for is remembered, and what it did not ask
-//! for is unknown.
+//! A derived reader stops at the first wrong key. Here every key that is asked for is remembered, and what was not asked for is
+//! unknown.
 
 use std::fmt;
 use std::ops::RangeInclusive;
@@ -11,14 +11,16 @@ use toml::Value;
 use crate::device::Mistake;
 use crate::link::{Line, Port, Target};
 
-/// A device table being read.
-pub(crate) struct Keys {
+/// A table being read. Every reading method answers `None` where the key is absent or wrong; the latter is noted.
+#[derive(Debug)]
+pub struct Keys {
     table: toml::Table,
     known: Vec<&'static str>,
     mistakes: Vec<Mistake>,
 }
 
 impl Keys {
+    /// A table of which nothing has been read.
     pub fn new(table: toml::Table) -> Keys {
         Keys {
             table,
@@ -39,6 +41,71 @@ impl Keys {
     fn value(&mut self, key: &'static str) -> Option<Value> {
         self.known.push(key);
         self.table.remove(key)
+    }
+
+    /// What `read` makes of `key`, which must be there.
+    pub fn needed<T>(
+        &mut self,
+        key: &'static str,
+        expected: &str,
+        read: impl FnOnce(&mut Keys, &'static str) -> Option<T>,
+    ) -> Option<T> {
+        if !self.table.contains_key(key) {
+            self.known.push(key);
+            self.wrong(key, "nothing", expected);
+            return None;
+        }
+        read(self, key)
+    }
+
+    /// Whether there is such a key.
+    pub fn contains(&self, key: &str) -> bool {
+        self.table.contains_key(key)
+    }
+
+    /// The table under `key`.
+    pub fn table(&mut self, key: &'static str) -> Option<toml::Table> {
+        match self.value(key)? {
+            Value::Table(table) => Some(table),
+            other => {
+                self.wrong(key, shown(&other), &format!("a table [{key}]"));
+                None
+            }
+        }
+    }
+
+    /// The tables of the array under `key`; none where it is absent.
+    pub fn tables(&mut self, key: &'static str) -> Vec<toml::Table> {
+        let Some(value) = self.value(key) else {
+            return Vec::new();
+        };
+        let entries = value.as_array().map(Vec::as_slice).unwrap_or_default();
+        let tables: Vec<toml::Table> = entries
+            .iter()
+            .filter_map(|entry| entry.as_table().cloned())
+            .collect();
+        if tables.len() != entries.len() || !value.is_array() {
+            self.wrong(key, shown(&value), &format!("tables, each under [[{key}]]"));
+            return Vec::new();
+        }
+        tables
+    }
+
+    /// Takes over the mistakes of a table that stood under `key`; true where there were none.
+    pub fn adopt(&mut self, key: &str, inner: Keys) -> bool {
+        let mistakes = inner.finish().err().unwrap_or_default();
+        let sound = mistakes.is_empty();
+        self.mistakes
+            .extend(mistakes.into_iter().map(|inner| Mistake {
+                key: format!("{key}.{}", inner.key),
+                ..inner
+            }));
+        sound
+    }
+
+    /// What was not asked for, and the mistakes so far: for a table that two readers share.
+    pub fn into_rest(self) -> (toml::Table, Vec<Mistake>) {
+        (self.table, self.mistakes)
     }
 
     /// The text under `key`, not empty.
@@ -180,6 +247,9 @@ impl Keys {
     }
 
     /// Ends the reading: every key not asked for is unknown.
+    ///
+    /// # Errors
+    /// All mistakes of the table.
     pub fn finish(mut self) -> Result<(), Vec<Mistake>> {
         let left: Vec<String> = self.table.keys().cloned().collect();
         let known = format!("one of {}", self.known.join(", "));

@@ -239,11 +239,7 @@ fn build(defects: &Defects) -> (Scene, Faces) {
             DVec3::Z,
             BOSS_RADIUS_MM + defects.boss_radius_mm,
         )),
-        boss_top: s.add(Surface::plane(
-            "boss top",
-            DVec3::Z * BOSS_TOP_MM,
-            DVec3::Z,
-        )),
+        boss_top: s.add(Surface::plane("boss top", DVec3::Z * BOSS_TOP_MM, DVec3::Z)),
     };
     let chamfer = s.add(Surface::plane(
         "chamfer",
@@ -267,10 +263,8 @@ fn body(f: &Faces, chamfer: SurfaceId, defects: &Defects) -> Solid {
     if defects.chamfer_mm > 0.0 {
         plate.push(Solid::region(chamfer));
     }
-    let plate = Solid::all(plate).within(over(
-        DVec3::ZERO,
-        DVec3::new(length, width, PLATE_TOP_MM),
-    ));
+    let plate =
+        Solid::all(plate).within(over(DVec3::ZERO, DVec3::new(length, width, PLATE_TOP_MM)));
     let block = [f.left, f.wall, f.front, f.back, f.bottom, f.block_top];
     let block = Solid::all(block.map(Solid::region)).within(over(
         DVec3::ZERO,
@@ -302,25 +296,100 @@ fn edges(f: &Faces) -> Vec<NominalEdge> {
     let block_upright = |x, y| line([x, y, 0.0], [x, y, at(x, y)]);
     let wall_upright = |y| line([wall, y, top], [wall, y, at(wall, y)]);
     vec![
-        edge("front", [f.front, f.plate_top], Convex, line([wall, 0.0, top], [l, 0.0, top])),
-        edge("back", [f.back, f.plate_top], Convex, line([wall, w, top], [l, w, top])),
-        edge("right", [f.right, f.plate_top], Convex, line([l, 0.0, top], [l, w, top])),
-        edge("wall foot", [f.wall, f.plate_top], Concave, line([wall, 0.0, top], [wall, w, top])),
-        edge("boss top", [f.boss_side, f.boss_top], Convex, Curve::Circle(BOSS_TOP_MM)),
-        edge("boss foot", [f.boss_side, f.plate_top], Concave, Curve::Circle(top)),
-        edge("wall top", [f.wall, f.block_top], Convex, on_top([wall, 0.0], [wall, w])),
-        edge("left top", [f.left, f.block_top], Convex, on_top([0.0, 0.0], [0.0, w])),
-        edge("front top", [f.front, f.block_top], Convex, on_top([0.0, 0.0], [wall, 0.0])),
-        edge("back top", [f.back, f.block_top], Convex, on_top([0.0, w], [wall, w])),
+        edge(
+            "front",
+            [f.front, f.plate_top],
+            Convex,
+            line([wall, 0.0, top], [l, 0.0, top]),
+        ),
+        edge(
+            "back",
+            [f.back, f.plate_top],
+            Convex,
+            line([wall, w, top], [l, w, top]),
+        ),
+        edge(
+            "right",
+            [f.right, f.plate_top],
+            Convex,
+            line([l, 0.0, top], [l, w, top]),
+        ),
+        edge(
+            "wall foot",
+            [f.wall, f.plate_top],
+            Concave,
+            line([wall, 0.0, top], [wall, w, top]),
+        ),
+        edge(
+            "boss top",
+            [f.boss_side, f.boss_top],
+            Convex,
+            Curve::Circle(BOSS_TOP_MM),
+        ),
+        edge(
+            "boss foot",
+            [f.boss_side, f.plate_top],
+            Concave,
+            Curve::Circle(top),
+        ),
+        edge(
+            "wall top",
+            [f.wall, f.block_top],
+            Convex,
+            on_top([wall, 0.0], [wall, w]),
+        ),
+        edge(
+            "left top",
+            [f.left, f.block_top],
+            Convex,
+            on_top([0.0, 0.0], [0.0, w]),
+        ),
+        edge(
+            "front top",
+            [f.front, f.block_top],
+            Convex,
+            on_top([0.0, 0.0], [wall, 0.0]),
+        ),
+        edge(
+            "back top",
+            [f.back, f.block_top],
+            Convex,
+            on_top([0.0, w], [wall, w]),
+        ),
         edge("wall front", [f.wall, f.front], Convex, wall_upright(0.0)),
         edge("wall back", [f.wall, f.back], Convex, wall_upright(w)),
         edge("right front", [f.right, f.front], Convex, upright(l, 0.0)),
         edge("right back", [f.right, f.back], Convex, upright(l, w)),
-        edge("left front", [f.left, f.front], Convex, block_upright(0.0, 0.0)),
+        edge(
+            "left front",
+            [f.left, f.front],
+            Convex,
+            block_upright(0.0, 0.0),
+        ),
         edge("left back", [f.left, f.back], Convex, block_upright(0.0, w)),
-        edge("bottom front", [f.bottom, f.front], Convex, line([0.0; 3], [l, 0.0, 0.0])),
-        edge("bottom back", [f.bottom, f.back], Convex, line([0.0, w, 0.0], [l, w, 0.0])),
-        edge("bottom left", [f.bottom, f.left], Convex, line([0.0; 3], [0.0, w, 0.0])),
-        edge("bottom right", [f.bottom, f.right], Convex, line([l, 0.0, 0.0], [l, w, 0.0])),
+        edge(
+            "bottom front",
+            [f.bottom, f.front],
+            Convex,
+            line([0.0; 3], [l, 0.0, 0.0]),
+        ),
+        edge(
+            "bottom back",
+            [f.bottom, f.back],
+            Convex,
+            line([0.0, w, 0.0], [l, w, 0.0]),
+        ),
+        edge(
+            "bottom left",
+            [f.bottom, f.left],
+            Convex,
+            line([0.0; 3], [0.0, w, 0.0]),
+        ),
+        edge(
+            "bottom right",
+            [f.bottom, f.right],
+            Convex,
+            line([l, 0.0, 0.0], [l, w, 0.0]),
+        ),
     ]
 }

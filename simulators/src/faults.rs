@@ -253,20 +253,31 @@ mod tests {
             error("drop=1.5"),
             "faults: drop is \"1.5\", expected a probability from 0 to 1"
         );
-        assert_eq!(error("flip=nan"), "faults: flip is \"nan\", expected a probability from 0 to 1");
+        assert_eq!(
+            error("flip=nan"),
+            "faults: flip is \"nan\", expected a probability from 0 to 1"
+        );
         assert_eq!(
             error("unplug-after=soon"),
             "faults: unplug-after is \"soon\", expected a whole number"
         );
-        assert_eq!(error("jump=3"), "faults: jump is \"3\", expected N:COUNTS, two whole numbers");
-        assert_eq!(error("lumps=2"), "faults: lumps is \"2\", expected no value");
+        assert_eq!(
+            error("jump=3"),
+            "faults: jump is \"3\", expected N:COUNTS, two whole numbers"
+        );
+        assert_eq!(
+            error("lumps=2"),
+            "faults: lumps is \"2\", expected no value"
+        );
         assert_eq!(
             error("lose=0.1,lose=0.2"),
             "faults: lose is given twice, expected once; remove one"
         );
         let unknown = error("explode");
         assert!(
-            unknown.starts_with("faults: no fault is called \"explode\", expected one of lose=P, flip=P"),
+            unknown.starts_with(
+                "faults: no fault is called \"explode\", expected one of lose=P, flip=P"
+            ),
             "{unknown}"
         );
     }
@@ -283,7 +294,10 @@ mod tests {
         let mut out = Vec::new();
         let damaged = (0..500).filter(|_| line.carry(&[7; 40], &mut out)).count();
         let c = line.count;
-        assert_eq!(out.len() as u64, c.offered_bytes - c.lost_bytes + c.babbled_bytes);
+        assert_eq!(
+            out.len() as u64,
+            c.offered_bytes - c.lost_bytes + c.babbled_bytes
+        );
         // expected 500 (1 - 0.98^40) = 277, standard deviation 11
         assert!((230..=325).contains(&damaged), "{damaged}");
         let mut again = BadLine::new(&faults, 3);

@@ -21,3 +21,11 @@ pub mod pty;
 pub mod wire;
 
 pub mod open_profile;
+
+pub mod contact;
+
+pub mod grbl;
+
+pub mod demo_cell;
+
+pub mod devices;

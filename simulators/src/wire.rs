@@ -173,7 +173,12 @@ impl Wire {
 
 fn not_yet_is_zero(result: io::Result<usize>) -> io::Result<usize> {
     match result {
-        Err(e) if matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => {
+        Err(e)
+            if matches!(
+                e.kind(),
+                io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted
+            ) =>
+        {
             Ok(0)
         }
         other => other,
@@ -431,9 +436,7 @@ impl<M: Model> Serving<M> {
         loop {
             match self.wire.read(&mut buffer) {
                 Ok(0) => return true,
-                Ok(n) => self
-                    .model
-                    .take(&buffer[..n], Instant::now(), &mut self.out),
+                Ok(n) => self.model.take(&buffer[..n], Instant::now(), &mut self.out),
                 Err(_) => return false,
             }
         }

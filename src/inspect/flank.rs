@@ -9,6 +9,7 @@
 mod transition;
 mod variance;
 
+use super::clusters::{Clusters, NO_GROUP};
 use crate::geometry::fit::{LinearFit, fit_robust};
 
 /// Points of one flank in the coordinates of its edge, in order of arc length.
@@ -25,7 +26,7 @@ pub struct FlankPoints {
 }
 
 /// The scan line of a point of which nothing but its coordinates is known.
-pub const NO_LINE: u32 = u32::MAX;
+pub const NO_LINE: u32 = NO_GROUP;
 
 /// One point for [`FlankPoints::new`]: (s, r, deviation, line).
 pub type FlankPoint = (f64, f64, f64, u32);
@@ -177,8 +178,8 @@ struct WindowFit<const P: usize> {
     fit: LinearFit<P>,
     sigma: f64,
     cut_mm: f64,
-    lines: variance::Clusters<P>,
-    cells: variance::Clusters<P>,
+    lines: Clusters<P>,
+    cells: Clusters<P>,
 }
 
 type Series<const P: usize> = Vec<Result<WindowFit<P>, FlankGap>>;
@@ -260,8 +261,8 @@ fn fit_window<const P: usize>(
     let residual = |k: usize| values[k] - robust.fit.predict(&rows[k]);
     let sample = |k: &usize, group: u32| (group, rows[*k], residual(*k));
     Ok(WindowFit {
-        lines: variance::Clusters::new(kept.iter().map(|k| sample(k, line(*k))), &robust.fit),
-        cells: variance::Clusters::new(kept.iter().map(|k| sample(k, cell(*k))), &robust.fit),
+        lines: Clusters::new(kept.iter().map(|k| sample(k, line(*k))), &robust.fit),
+        cells: Clusters::new(kept.iter().map(|k| sample(k, cell(*k))), &robust.fit),
         fit: robust.fit,
         sigma: robust.sigma,
         cut_mm: range.cut_mm,

@@ -66,9 +66,7 @@ fn read(text: &str) -> Option<Line<'_>> {
         return Some(Line::Status(inner));
     }
     if let Some(setting) = text.strip_prefix('$') {
-        let Some((number, value)) = setting.split_once('=') else {
-            return None;
-        };
+        let (number, value) = setting.split_once('=')?;
         return match whole(number) {
             Some(number) => Some(Line::Setting(number, value)),
             None => number.starts_with('N').then_some(Line::Note(text)),
@@ -259,5 +257,180 @@ pub fn error_remedy(code: u32) -> &'static str {
         15 => "choose a target within the machine's travel",
         33 => "choose a target away from the start",
         _ => "check the controller's firmware and settings",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn probe(x: f64, y: f64, z: f64, contact: bool) -> Line<'static> {
+        Line::Probe(Probe {
+            position: [x, y, z],
+            contact,
+        })
+    }
+
+    #[test]
+    fn lines_of_the_manual() {
+        let check = |text, expected| assert_eq!(line(text), Ok(expected), "{text}");
+        check("ok", Line::Ok);
+        check("error:9", Line::Error(9));
+        check("ALARM:5", Line::Alarm(5));
+        check("$13=0", Line::Setting(13, "0"));
+        check("$110=500.000", Line::Setting(110, "500.000"));
+        check("$N0=G54", Line::Note("$N0=G54"));
+        check(">G54G20:ok", Line::Note(">G54G20:ok"));
+        check(
+            "[MSG:'$H'|'$X' to unlock]",
+            Line::Note("MSG:'$H'|'$X' to unlock"),
+        );
+        check("[VER:1.1h.20190825:]", Line::Version("1.1h.20190825", ""));
+        check(
+            "[VER:1.1f.20170801:Some string]",
+            Line::Version("1.1f.20170801", "Some string"),
+        );
+        check("[GC:G0 G54 G17]", Line::ParserState("G0 G54 G17"));
+        check(
+            "[G92:1.000,-2.000,0.500]",
+            Line::Offset("G92", [1.0, -2.0, 0.5]),
+        );
+        check("[TLO:0.000]", Line::ToolLength(0.0));
+        check("[TLO:0.000,0.000,3.500]", Line::ToolLength(3.5));
+        check(
+            "<Idle|MPos:0.000,0.000,0.000|FS:0,0>",
+            Line::Status("Idle|MPos:0.000,0.000,0.000|FS:0,0"),
+        );
+        check(
+            "Grbl 1.1h ['$' for help]",
+            Line::Banner("Grbl 1.1h ['$' for help]"),
+        );
+        check(
+            "GrblHAL 1.1f ['$' or '$HELP' for help]",
+            Line::Banner("GrblHAL 1.1f ['$' or '$HELP' for help]"),
+        );
+        check("[PRB:0.000,0.000,1.492:1]", probe(0.0, 0.0, 1.492, true));
+        // Six axes, as ioSender's users report them.
+        check(
+            "[PRB:87.504,13.055,-41.232,0.000,0.000,0.000:0]",
+            probe(87.504, 13.055, -41.232, false),
+        );
+    }
+
+    #[test]
+    fn damaged_lines_are_refused() {
+        for text in [
+            // Seen by users of Universal G-code Sender: a status report fell into a result.
+            "[PRB:-488.000,-498.000]>:-48",
+            "[PRB:-488.000,<Idle|MPos:0.000,0.000,0.000>-498.000,1.000:1]",
+            "[PRB:1.000,2.000:1]",
+            "[PRB:1.000,2.000,3.000]",
+            "[PRB:1.000,2.000,3.000:2]",
+            "[PRB:1.000,2.000,3.000:1",
+            "[PRB:1.000,2.000,3:1]",
+            "[PRB:1.000,2.000,3.0e5:1]",
+            "[PRB:1.000,2.000,nan:1]",
+            "[PRB:1.000,2.000,+3.000:1]",
+            "[PRB:1.000,,3.000:1]",
+            "[PRB:1.000,2.000,3.000,4.0,5.0,6.0,7.0:1]",
+            "[PRB:1.000,2.000,3.000:1[PRB:1.000,2.000,3.000:1]]",
+            "[PRB:12345678.000,2.000,3.000:1]",
+            "ALARM:",
+            "error:-1",
+            "error:123456",
+            "okok",
+            "o",
+            "$13",
+            "<Idle",
+            "[]",
+            "\u{17f}rbl",
+        ] {
+            assert!(line(text).is_err(), "{text}");
+        }
+        let error = line("[PRB:-488.000,-498.000]>:-48").expect_err("a damaged line");
+        assert_eq!(
+            error.to_string(),
+            "the line \"[PRB:-488.000,-498.000]>:-48\" is none the controller may send"
+        );
+    }
+
+    fn assemble(assembler: &mut Assembler, bytes: &[u8]) -> Vec<String> {
+        let mut lines = Vec::new();
+        assembler.take(bytes, |line| lines.push(format!("{line:?}")));
+        lines
+    }
+
+    #[test]
+    fn split_at_every_byte() {
+        let stream = b"\r\nGrbl 1.1h ['$' for help]\r\n[PRB:1.000,2.000,3.000:1]\r\nok\r\n";
+        let whole = assemble(&mut Assembler::default(), stream);
+        assert_eq!(whole.len(), 3);
+        for cut in 0..=stream.len() {
+            let mut assembler = Assembler::default();
+            let mut parts = assemble(&mut assembler, &stream[..cut]);
+            parts.extend(assemble(&mut assembler, &stream[cut..]));
+            assert_eq!(parts, whole, "cut at {cut}");
+        }
+    }
+
+    #[test]
+    fn a_line_without_end_is_dropped_whole() {
+        let mut assembler = Assembler::default();
+        assert!(assemble(&mut assembler, &[b'x'; 100_000]).is_empty());
+        assert_eq!(assembler.held_bytes(), LENGTH_MAX);
+        let lines = assemble(&mut assembler, b"ok\r\nok\r\n");
+        assert_eq!(lines.len(), 2);
+        assert!(lines[0].starts_with("Err("), "{}", lines[0]);
+        assert_eq!(lines[1], "Ok(Ok)");
+    }
+
+    #[test]
+    fn bytes_that_are_no_text_spoil_one_line() {
+        let lines = assemble(&mut Assembler::default(), b"o\xFFk\nok\n");
+        assert!(lines[0].starts_with("Err("));
+        assert_eq!(lines[1], "Ok(Ok)");
+    }
+
+    #[test]
+    fn alarms_and_errors_have_words() {
+        for code in 0..12 {
+            let (meaning, remedy) = alarm(code);
+            assert!(!meaning.is_empty() && !remedy.is_empty());
+        }
+        assert_eq!(alarm(5).0, "the probe met nothing");
+        assert_eq!(error(9), "locked by an alarm");
+        assert_eq!(
+            error_remedy(15),
+            "choose a target within the machine's travel"
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn results_survive_the_round_trip(
+            position in prop::array::uniform3(-9_999_999_i32..=9_999_999),
+            more in 0_usize..=3,
+            contact: bool,
+        ) {
+            let mm = position.map(|thousandths| f64::from(thousandths) / 1000.0);
+            let mut text = format!("[PRB:{:.3},{:.3},{:.3}", mm[0], mm[1], mm[2]);
+            text.push_str(&",0.000".repeat(more));
+            text.push_str(&format!(":{}]", u8::from(contact)));
+            prop_assert_eq!(line(&text), Ok(probe(mm[0], mm[1], mm[2], contact)));
+        }
+
+        #[test]
+        fn any_bytes_never_panic_and_never_grow(bytes in prop::collection::vec(any::<u8>(), 0..3000)) {
+            let mut assembler = Assembler::default();
+            assembler.take(&bytes, |_| {});
+            prop_assert!(assembler.held_bytes() <= LENGTH_MAX);
+        }
+
+        #[test]
+        fn any_text_never_panics(text in "[\\[<$]?(PRB|ALARM|error|G54|ok|TLO)?[:.,0-9a-z\\]>-]{0,40}") {
+            let _ = line(&text);
+        }
     }
 }

@@ -17,9 +17,10 @@ use crate::error::LinkError;
 /// Longest wait for one address of a TCP host. 2 s is two lost SYN packets; a local network needs a millisecond.
 const CONNECT: Duration = Duration::from_secs(2);
 
-/// Silence after which the system asks whether a TCP peer is still there; with [`PROBES`] a pulled cable shows within 2.5 s.
+/// Silence after which the system asks whether a TCP peer is still there; with [`PROBES`] a pulled cable shows within 4 s. The system counts
+/// these times in whole seconds.
 const PROBE_AFTER: Duration = Duration::from_secs(1);
-const PROBE_EVERY: Duration = Duration::from_millis(500);
+const PROBE_EVERY: Duration = Duration::from_secs(1);
 const PROBES: u32 = 3;
 
 /// Most bytes given to a serial port at once. The Linux tty layer calls a port writable only when fewer than 256 bytes wait

@@ -213,8 +213,11 @@ mod tests {
 
     use super::*;
 
-    /// Every frame that comes out, as (type, id, payload), and the errors.
-    fn decode(decoder: &mut Decoder, bytes: &[u8]) -> (Vec<(u8, u32, Vec<u8>)>, Vec<DecodeError>) {
+    /// Type, id and payload of a frame.
+    type Parts = (u8, u32, Vec<u8>);
+
+    /// Every frame that comes out, and the errors.
+    fn decode(decoder: &mut Decoder, bytes: &[u8]) -> (Vec<Parts>, Vec<DecodeError>) {
         let (mut frames, mut errors) = (Vec::new(), Vec::new());
         decoder.take(bytes, |frame| match frame {
             Ok(frame) => frames.push((frame.kind, frame.id, frame.payload.to_vec())),

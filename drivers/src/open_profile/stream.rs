@@ -35,6 +35,10 @@ const STALL: Duration = Duration::from_millis(250);
 /// Most replies that nobody asked for yet.
 const REPLIES: usize = 16;
 
+/// KEEPALIVE, sent every half of their time, after which a device that says nothing counts as silent: the three periods
+/// after which the device gives us up. Counted and not timed, so that a computer that slept does not accuse the device.
+const UNANSWERED: u32 = 6;
+
 /// Ids of KEEPALIVE have this bit, ids of all other commands do not.
 const KEEPALIVE_ID: u32 = 1 << 31;
 
@@ -84,6 +88,8 @@ pub(super) struct Run {
     pub number: u32,
     pub keepalive: Duration,
     next_keepalive: Instant,
+    /// KEEPALIVE sent since the last byte was heard.
+    unanswered: u32,
     /// The sequence number that comes next where nothing is lost.
     expected: u32,
     skipped_before: u64,
@@ -183,6 +189,7 @@ impl Inbox {
             number,
             keepalive,
             next_keepalive: Instant::now() + keepalive / 2,
+            unanswered: 0,
             expected: 0,
             skipped_before: self.skipped_bytes,
             stopped: None,
@@ -194,6 +201,14 @@ impl Inbox {
         let profile = self.profiles.pop_front()?;
         self.queued_bytes -= size(&profile);
         Some(profile)
+    }
+
+    fn heard_something(&mut self, bytes: usize) {
+        self.heard = Instant::now();
+        self.heard_bytes += bytes as u64;
+        if let Some(run) = &mut self.run {
+            run.unanswered = 0;
+        }
     }
 
     /// No profile more fits in, for now.
@@ -316,7 +331,8 @@ pub(super) fn run(link: &Arc<dyn Link>, shared: &Shared) {
         if inbox.full() {
             let waited = shared.taken.wait_timeout(inbox, SLICE);
             // Nothing was heard because nobody listened.
-            waited.unwrap_or_else(PoisonError::into_inner).0.heard = Instant::now();
+            let mut inbox = waited.unwrap_or_else(PoisonError::into_inner).0;
+            inbox.heard_something(0);
         } else {
             drop(inbox);
             line.read(shared);
@@ -346,8 +362,7 @@ impl Line<'_> {
                 }
             }
             Ok(n) => {
-                inbox.heard = now;
-                inbox.heard_bytes += n as u64;
+                inbox.heard_something(n);
                 self.decoder
                     .take(&self.chunk[..n], |frame| inbox.accept(frame, now));
             }
@@ -365,7 +380,6 @@ impl Line<'_> {
         let now = Instant::now();
         let mut inbox = shared.lock();
         let caller_there = inbox.waiting || now.saturating_duration_since(inbox.asked) < PATIENCE;
-        let quiet = now.saturating_duration_since(inbox.heard);
         let Some(run) = inbox.run.as_mut().filter(|run| run.stopped.is_none()) else {
             return;
         };
@@ -379,7 +393,8 @@ impl Line<'_> {
             tracing::warn!("nobody takes profiles: the run is left to end by itself");
             return;
         }
-        if quiet > 3 * keepalive {
+        run.unanswered += 1;
+        if run.unanswered > UNANSWERED {
             inbox.over = Some(Over::Silent(3 * keepalive));
             shared.arrived.notify_all();
             return;

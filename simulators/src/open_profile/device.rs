@@ -223,7 +223,10 @@ impl Device {
             let text = format!("version {}, this device speaks {VERSION}", frame.version);
             Some((Status::UnknownCommand, text))
         } else if name.is_empty() {
-            Some((Status::UnknownCommand, format!("type 0x{:02x}?", frame.kind)))
+            Some((
+                Status::UnknownCommand,
+                format!("type 0x{:02x}?", frame.kind),
+            ))
         } else if p.len() < least {
             let text = format!("{name} has {} bytes, needs {least}", p.len());
             Some((Status::TooShort, text))
@@ -398,7 +401,9 @@ impl Device {
             run: last.run,
             boot: self.boot,
             time_ns,
-            encoder: line.encoder.wrapping_add(jump.map_or(0, |(_, counts)| counts)),
+            encoder: line
+                .encoder
+                .wrapping_add(jump.map_or(0, |(_, counts)| counts)),
             dropped: last.dropped,
             flags: 1 | u16::from(line.saturated) << 1,
             scale: self.scale(),
@@ -428,7 +433,11 @@ impl Device {
         }
         if lie {
             let stated = self.chance.random_range(0..=65_536);
-            let stated = if stated == payload.len() as u32 { 0 } else { stated };
+            let stated = if stated == payload.len() as u32 {
+                0
+            } else {
+                stated
+            };
             let frame = encode_with_length(msg::PROFILE, sequence, payload, stated);
             self.send(&frame, out);
             return Fate::Damaged;
@@ -574,7 +583,10 @@ impl Model for Device {
             Next::At(due) => Some(due),
         };
         let lapse = lapse.filter(|_| self.run.is_some());
-        let due = [due, lapse, self.receiver.deadline()].into_iter().flatten().min();
+        let due = [due, lapse, self.receiver.deadline()]
+            .into_iter()
+            .flatten()
+            .min();
         due.map_or(Next::Wait, Next::At)
     }
 }

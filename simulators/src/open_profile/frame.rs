@@ -19,7 +19,11 @@ pub(super) fn crc32c(bytes: &[u8]) -> u32 {
             let mut c = i as u32;
             let mut bit = 0;
             while bit < 8 {
-                c = if c & 1 == 1 { c >> 1 ^ 0x82F6_3B78 } else { c >> 1 };
+                c = if c & 1 == 1 {
+                    c >> 1 ^ 0x82F6_3B78
+                } else {
+                    c >> 1
+                };
                 bit += 1;
             }
             table[i] = c;
@@ -27,9 +31,9 @@ pub(super) fn crc32c(bytes: &[u8]) -> u32 {
         }
         table
     };
-    !bytes.iter().fold(!0, |c: u32, &b| {
-        c >> 8 ^ table_entry(&TABLE, c, b)
-    })
+    !bytes
+        .iter()
+        .fold(!0, |c: u32, &b| c >> 8 ^ table_entry(&TABLE, c, b))
 }
 
 fn table_entry(table: &[u32; 256], c: u32, b: u8) -> u32 {
@@ -167,7 +171,9 @@ mod tests {
         for byte in stream {
             receiver.take(&[byte], now);
         }
-        let ids: Vec<u32> = std::iter::from_fn(|| receiver.next(now)).map(|f| f.id).collect();
+        let ids: Vec<u32> = std::iter::from_fn(|| receiver.next(now))
+            .map(|f| f.id)
+            .collect();
         assert_eq!(ids, [2, 3]);
         assert_eq!(receiver.deadline(), None);
     }

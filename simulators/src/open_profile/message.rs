@@ -250,10 +250,22 @@ mod tests {
             ("identity", encode(IDENTITY, 1, &identity.payload())),
             ("value-rate", encode(VALUE, 2, &rate)),
             ("set-refused", encode(VALUE, 3, &columns)),
-            ("started", encode(STARTED, 4, &started(Status::Done, 7, BOOT))),
-            ("alive", encode(ALIVE, 5, &alive(1_000_000, 2_600_000, BOOT, true))),
-            ("stopped", encode(STOPPED, 6, &stopped(Reason::Asked, 7, 2, 3))),
-            ("refused", encode(REFUSED, 9, &refused(Status::UnknownCommand, "type 0x42?"))),
+            (
+                "started",
+                encode(STARTED, 4, &started(Status::Done, 7, BOOT)),
+            ),
+            (
+                "alive",
+                encode(ALIVE, 5, &alive(1_000_000, 2_600_000, BOOT, true)),
+            ),
+            (
+                "stopped",
+                encode(STOPPED, 6, &stopped(Reason::Asked, 7, 2, 3)),
+            ),
+            (
+                "refused",
+                encode(REFUSED, 9, &refused(Status::UnknownCommand, "type 0x42?")),
+            ),
         ] {
             assert_eq!(frame, example(name), "{name}");
         }

@@ -83,9 +83,7 @@ pub(crate) fn sign_changes<const N: usize>(coefficients: [f64; N]) -> Roots {
 }
 
 fn variations<const N: usize>(c: &[f64; N]) -> usize {
-    (1..N)
-        .filter(|&i| (c[i - 1] < 0.0) != (c[i] < 0.0))
-        .count()
+    (1..N).filter(|&i| (c[i - 1] < 0.0) != (c[i] < 0.0)).count()
 }
 
 /// De Casteljau's subdivision in the middle.

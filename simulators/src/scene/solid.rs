@@ -63,7 +63,10 @@ impl Surfaces {
 
     /// All of them with their numbers.
     pub fn iter(&self) -> impl Iterator<Item = (SurfaceId, &Surface)> {
-        self.0.iter().enumerate().map(|(i, s)| (SurfaceId(i as u32), s))
+        self.0
+            .iter()
+            .enumerate()
+            .map(|(i, s)| (SurfaceId(i as u32), s))
     }
 
     /// A box between two corners, with the numbers of its sides: -x, +x, -y, +y, -z, +z.
@@ -92,7 +95,12 @@ impl Surfaces {
         radius: f64,
     ) -> (Solid, [SurfaceId; 3]) {
         let ids = [
-            self.add(Surface::cylinder(&format!("{name} side"), base, axis, radius)),
+            self.add(Surface::cylinder(
+                &format!("{name} side"),
+                base,
+                axis,
+                radius,
+            )),
             self.add(Surface::plane(&format!("{name} base"), base, -axis)),
             self.add(Surface::plane(&format!("{name} top"), base + axis, axis)),
         ];
@@ -109,7 +117,12 @@ impl Surfaces {
         half_angle_rad: f64,
     ) -> (Solid, [SurfaceId; 2]) {
         let ids = [
-            self.add(Surface::cone(&format!("{name} side"), apex, axis, half_angle_rad)),
+            self.add(Surface::cone(
+                &format!("{name} side"),
+                apex,
+                axis,
+                half_angle_rad,
+            )),
             self.add(Surface::plane(&format!("{name} base"), apex + axis, axis)),
         ];
         let radius = axis.length() * half_angle_rad.tan();
@@ -148,7 +161,11 @@ impl Surfaces {
                 DVec3::Z * z[0],
                 DVec3::NEG_Z,
             )),
-            self.add(Surface::plane(&format!("{name} top"), DVec3::Z * z[1], DVec3::Z)),
+            self.add(Surface::plane(
+                &format!("{name} top"),
+                DVec3::Z * z[1],
+                DVec3::Z,
+            )),
         ];
         let mut bounds = Bounds::EMPTY;
         for (i, &a) in polygon.iter().enumerate() {
@@ -235,9 +252,7 @@ impl Solid {
     /// Inside all of them.
     pub fn all(solids: impl IntoIterator<Item = Solid>) -> Solid {
         let solids: Vec<Solid> = solids.into_iter().collect();
-        let bounds = solids
-            .iter()
-            .fold(Bounds::ALL, |b, s| b.common(&s.bounds));
+        let bounds = solids.iter().fold(Bounds::ALL, |b, s| b.common(&s.bounds));
         Solid {
             bounds,
             node: Node::All(solids),
@@ -313,26 +328,13 @@ impl Solid {
 
     /// The parts of the ray inside the solid.
     pub(super) fn spans(&self, surfaces: &Surfaces, ray: &Ray, window: Window) -> Spans {
-        let Some(window) = self.bounds.clip(ray.origin, ray.direction, window) else {
+        let Some(window) = self.bounds.clip(ray, window) else {
             return Spans::new();
         };
         match &self.node {
             Node::Region(id) => surfaces.get(*id).spans(*id, ray, window),
             Node::Prism(prism) => prism.spans(ray, window),
-            Node::All(solids) => {
-                let mut spans = window.whole();
-                for solid in solids {
-                    let (Some(first), Some(last)) = (spans.first(), spans.last()) else {
-                        break;
-                    };
-                    let hull = Window {
-                        from: first.enter.t,
-                        to: last.leave.t,
-                    };
-                    spans = both(&spans, &solid.spans(surfaces, ray, hull));
-                }
-                spans
-            }
+            Node::All(solids) => common_spans(solids, surfaces, ray, window),
             Node::Any(solids) => solids.iter().fold(Spans::new(), |spans, solid| {
                 either(&spans, &solid.spans(surfaces, ray, window))
             }),
@@ -383,6 +385,41 @@ impl Solid {
             Node::Not(solid) => solid.place(pose),
         }
     }
+}
+
+/// Spans inside all of them. The planes among them, and mostly all are, only move the two ends of one span.
+fn common_spans(solids: &[Solid], surfaces: &Surfaces, ray: &Ray, window: Window) -> Spans {
+    let mut one = Span {
+        enter: Crossing::OPEN_START.moved(window.from),
+        leave: Crossing::OPEN_END.moved(window.to),
+    };
+    let mut others = smallvec::SmallVec::<[&Solid; 8]>::new();
+    for solid in solids {
+        match &solid.node {
+            Node::Region(id) => match &surfaces.get(*id).shape {
+                Shape::Plane { normal, offset } => {
+                    if !one.cut((*normal, *offset), *id, ray) {
+                        return Spans::new();
+                    }
+                }
+                _ => others.push(solid),
+            },
+            _ => others.push(solid),
+        }
+    }
+    let mut spans = Spans::new();
+    spans.push(one);
+    for solid in others {
+        let (Some(first), Some(last)) = (spans.first(), spans.last()) else {
+            break;
+        };
+        let hull = Window {
+            from: first.enter.t,
+            to: last.leave.t,
+        };
+        spans = both(&spans, &solid.spans(surfaces, ray, hull));
+    }
+    spans
 }
 
 impl Prism {

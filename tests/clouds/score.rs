@@ -1,0 +1,120 @@
+//! Precision and recall of a detection against the true edges.
+
+use acies::features::Class;
+use acies::points::{Frame, Neighbors, PointCloud};
+use glam::DVec3;
+
+use super::{Line, Sampled};
+
+/// How well edges were found.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Score {
+    /// Share of the detected points within one spacing of a true edge.
+    pub precision: f64,
+    /// Share of the edges' length with a detection within one spacing, or of the points made on edges that are detected.
+    pub recall: f64,
+    /// Detected points.
+    pub detected: usize,
+}
+
+impl Score {
+    pub fn f1(&self) -> f64 {
+        2.0 * self.precision * self.recall / (self.precision + self.recall).max(1e-12)
+    }
+}
+
+/// The cloud as the library takes it.
+pub fn cloud(points: &[DVec3]) -> PointCloud {
+    PointCloud {
+        frame: Frame::Part,
+        positions: points.to_vec(),
+        origins: Vec::new(),
+        views: Vec::new(),
+    }
+}
+
+pub fn is_edge(class: &Class) -> bool {
+    matches!(class, Class::Edge | Class::Corner)
+}
+
+/// Distance to the nearest of the lines.
+pub fn distance(lines: &[Line], p: DVec3) -> f64 {
+    lines
+        .iter()
+        .map(|l| l.distance(p))
+        .fold(f64::INFINITY, f64::min)
+}
+
+/// The score of the points for which `found` holds.
+pub fn score(sampled: &Sampled, found: &[bool]) -> Score {
+    let detected: Vec<DVec3> = sampled
+        .points
+        .iter()
+        .zip(found)
+        .filter(|(_, f)| **f)
+        .map(|(p, _)| *p)
+        .collect();
+    let s = sampled.spacing;
+    let good = detected
+        .iter()
+        .filter(|p| distance(&sampled.edges, **p) <= s * (1.0 + 1e-9))
+        .count();
+    let recall = if sampled.on_edge.is_empty() {
+        length_recall(sampled, &detected)
+    } else {
+        let on_edge = sampled.on_edge.iter().filter(|o| **o).count();
+        let hit = sampled
+            .on_edge
+            .iter()
+            .zip(found)
+            .filter(|(o, f)| **o && **f)
+            .count();
+        hit as f64 / on_edge as f64
+    };
+    Score {
+        precision: good as f64 / detected.len().max(1) as f64,
+        recall,
+        detected: detected.len(),
+    }
+}
+
+/// Share of the edges' length within one spacing of a detected point, where the cloud itself comes within one spacing.
+fn length_recall(sampled: &Sampled, detected: &[DVec3]) -> f64 {
+    let s = sampled.spacing;
+    let hits = Neighbors::new(detected);
+    let all = Neighbors::new(&sampled.points);
+    let near = |set: &Neighbors, p: DVec3| {
+        let mut found = Vec::new();
+        set.nearest(p, 1, &mut found);
+        found.first().is_some_and(|f| f.1 <= s * s)
+    };
+    let (mut length, mut covered) = (0usize, 0usize);
+    for edge in &sampled.edges {
+        let steps = (edge.length() / (0.1 * s)).ceil().max(1.0) as usize;
+        for i in 0..steps {
+            let p = edge.at((i as f64 + 0.5) / steps as f64);
+            if sampled.scanned && !near(&all, p) {
+                continue;
+            }
+            length += 1;
+            covered += usize::from(near(&hits, p));
+        }
+    }
+    covered as f64 / length.max(1) as f64
+}
+
+/// The score of a detection.
+pub fn score_classes(sampled: &Sampled, classes: &[Class]) -> Score {
+    let found: Vec<bool> = classes.iter().map(is_edge).collect();
+    score(sampled, &found)
+}
+
+/// The score of marking exactly the points within one spacing of a true edge.
+pub fn oracle(sampled: &Sampled) -> Score {
+    let found: Vec<bool> = sampled
+        .points
+        .iter()
+        .map(|p| distance(&sampled.edges, *p) <= sampled.spacing)
+        .collect();
+    score(sampled, &found)
+}
