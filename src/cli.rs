@@ -2,6 +2,7 @@
 
 mod check;
 mod devices;
+mod reconstruct;
 
 use std::process::ExitCode;
 
@@ -12,6 +13,8 @@ pub enum Command {
     Check(check::Check),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
+    /// Take the points of a scan onto the surface they were measured from.
+    Reconstruct(reconstruct::Reconstruct),
 }
 
 impl Command {
@@ -23,6 +26,7 @@ impl Command {
         match self {
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
+            Command::Reconstruct(command) => command.run(),
         }
     }
 }
