@@ -9,11 +9,12 @@ use acies_drivers::capture::Touch;
 use acies_drivers::device::{Identity, Instrument, Probe};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::Links;
+use glam::DVec3;
 
 use crate::acquire::{Profiling, Scan, ScanError, ScanEvent, scan};
 use crate::config::{Cell, ProbeConfig};
 use crate::inspect::result::{Inspection, Verdict};
-use crate::inspect::{Recipe, Start, TouchedPoint, inspect};
+use crate::inspect::{self, Recipe, Request, Start};
 use crate::nominal::{Nominal, NominalError};
 
 /// How long one touch may take: a machine that crosses a metre at 10 mm/s needs 100 s.
@@ -131,4 +132,176 @@ pub enum CellError {
     /// The scan did not start.
     #[error(transparent)]
     Scan(#[from] ScanError),
+}
+
+/// Reads a recipe, or the default one where the cell has none.
+///
+/// # Errors
+/// [`CellError::RecipeFile`] and [`CellError::Recipe`].
+pub fn read_recipe(path: Option<&PathBuf>) -> Result<Recipe, CellError> {
+    let Some(path) = path else {
+        return Ok(Recipe::default());
+    };
+    let text = std::fs::read_to_string(path).map_err(|source| CellError::RecipeFile {
+        path: path.clone(),
+        source,
+    })?;
+    Recipe::parse(&text).map_err(|mistakes| {
+        let lines: Vec<String> = mistakes.iter().map(ToString::to_string).collect();
+        CellError::Recipe {
+            path: path.clone(),
+            mistakes: lines.join("\n"),
+        }
+    })
+}
+
+/// Runs one inspection of the part that lies in the cell.
+///
+/// # Errors
+/// [`CellError`] when the job could not be begun or a touch failed. A device that is lost in mid-scan is no error: the
+/// outcome then says that it is not decidable, and why.
+pub fn run(
+    cell: &Cell,
+    links: &dyn Links,
+    watch: &mut dyn FnMut(State),
+) -> Result<Outcome, CellError> {
+    let nominal = Nominal::read(&cell.nominal)?;
+    let recipe = read_recipe(cell.recipe.as_ref())?;
+    let profilers = open_profilers(cell, links, watch)?;
+    let (probes, touches) = touch_all(cell, links, watch)?;
+    let began = Instant::now();
+    let (scan, profilers) = scan(profilers, cell.plan, &mut |event| {
+        watch(match event {
+            ScanEvent::Progress { profiles, share } => State::Scanning { profiles, share },
+            ScanEvent::Lost { device, error } => State::Lost { device, error },
+        });
+    })?;
+    let scanned = Instant::now();
+    drop(profilers);
+    watch(State::Inspecting);
+    let start = Start::Rough(cell.machine_from_part.inverse());
+    let request = Request {
+        touches: &touches,
+        ..Request::new(&recipe, start)
+    };
+    let mut inspection = inspect::inspect(&scan.cloud, &nominal, &request);
+    judge_completeness(&scan, &mut inspection);
+    Ok(Outcome {
+        scan_seconds: (scanned - began).as_secs_f64(),
+        verdict_seconds: scanned.elapsed().as_secs_f64(),
+        scan,
+        nominal,
+        recipe,
+        probes,
+        inspection,
+    })
+}
+
+fn open(
+    device: &str,
+    setup: &dyn acies_drivers::device::Setup,
+    links: &dyn Links,
+    watch: &mut dyn FnMut(State),
+) -> Result<Instrument, CellError> {
+    watch(State::Opening {
+        device: device.to_owned(),
+    });
+    setup.open(links).map_err(|source| CellError::Device {
+        device: device.to_owned(),
+        source,
+    })
+}
+
+fn open_profilers(
+    cell: &Cell,
+    links: &dyn Links,
+    watch: &mut dyn FnMut(State),
+) -> Result<Vec<Profiling>, CellError> {
+    let mut opened = Vec::new();
+    for config in &cell.profilers {
+        let Instrument::Profiler(profiler) = open(&config.name, &*config.setup, links, watch)?
+        else {
+            let device = config.name.clone();
+            return Err(CellError::Kind {
+                device,
+                found: "probe",
+                expected: "profiler",
+                table: "tip",
+            });
+        };
+        let (name, calibration) = (config.name.clone(), config.calibration);
+        opened.push(Profiling {
+            name,
+            profiler,
+            calibration,
+        });
+    }
+    Ok(opened)
+}
+
+/// Touches what the cell plans; the probes are closed again before the scan.
+fn touch_all(
+    cell: &Cell,
+    links: &dyn Links,
+    watch: &mut dyn FnMut(State),
+) -> Result<(Vec<(String, Identity)>, Vec<inspect::Touch>), CellError> {
+    let of = cell.probes.iter().map(|probe| probe.touches.len()).sum();
+    let mut touched = Vec::new();
+    let mut identities = Vec::new();
+    for config in &cell.probes {
+        let Instrument::Probe(mut probe) = open(&config.name, &*config.setup, links, watch)? else {
+            let (device, table) = (config.name.clone(), "calibration");
+            return Err(CellError::Kind {
+                device,
+                found: "profiler",
+                expected: "probe",
+                table,
+            });
+        };
+        for index in 0..config.touches.len() {
+            watch(State::Touching {
+                done: touched.len(),
+                of,
+            });
+            let touch = touch(cell, config, probe.as_mut(), index)?;
+            // The tip's centre goes along the planned direction, which is the normal but for the fixture's error of a
+            // degree or two: of a radius of 1 mm that leaves less than 0.5 um.
+            let centre = DVec3::from(touch.tip_centre_mm);
+            let point = centre + DVec3::from(touch.direction) * config.tip_radius_mm;
+            touched.push(inspect::Touch {
+                point,
+                u_mm: config.u_touch_mm,
+            });
+        }
+        identities.push((config.name.clone(), probe.identity().clone()));
+    }
+    Ok((identities, touched))
+}
+
+fn touch(
+    cell: &Cell,
+    config: &ProbeConfig,
+    probe: &mut dyn Probe,
+    index: usize,
+) -> Result<Touch, CellError> {
+    let planned = config.touches[index];
+    let start = cell.machine_from_part.point(planned.start_mm);
+    let target = cell.machine_from_part.point(planned.target_mm);
+    probe
+        .touch(start.into(), target.into(), TOUCH_TIMEOUT)
+        .map_err(|source| CellError::Touch {
+            device: config.name.clone(),
+            index: index + 1,
+            source,
+        })
+}
+
+/// A scan that is not whole decides nothing in the part's favour: what was measured may still prove it not OK.
+fn judge_completeness(scan: &Scan, inspection: &mut Inspection) {
+    for view in &scan.views {
+        inspection.findings.extend(view.findings.iter().cloned());
+        if !view.complete {
+            inspection.verdict = inspection.verdict.max(Verdict::NotDecidable);
+        }
+    }
 }

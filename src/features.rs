@@ -10,6 +10,7 @@ use crate::points::{Neighbors, PointCloud, Spacing, noise_mm, spacing};
 mod adaptive;
 mod flanks;
 mod patch;
+pub mod profile;
 mod tangent;
 
 use adaptive::{Places, Sights};

@@ -27,7 +27,7 @@ use align::{Aligned, Scan, align};
 use assign::Surface;
 use body::BodyEdge;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges};
-use result::{EdgeResult, StationResult, Verdict};
+use result::{EdgeResult, ScanEstimate, StationResult, Verdict};
 
 use crate::features::{self, Method};
 use crate::points::{Frame, Neighbors, PointCloud, noise_mm, spacing};
@@ -123,6 +123,11 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         verdict,
         seconds: stages.end(),
         findings,
+        scan: Some(ScanEstimate {
+            spacing: scan.spacing,
+            noise_mm: scan.noise_mm,
+            classes: detection.classes,
+        }),
     }
 }
 

@@ -22,6 +22,8 @@ pub mod acquire;
 
 pub mod config;
 
+pub mod cell;
+
 pub mod web;
 
 pub mod cli;

@@ -15,10 +15,11 @@ mod ply;
 mod table;
 pub mod wire;
 
-use std::collections::BTreeMap;
 use std::time::SystemTime;
 
 use acies_drivers::device::{Identity, Losses};
+
+use crate::inspect::recipe::Recipe;
 
 pub use file::ReportError;
 pub use html::content_security_policy;
@@ -42,7 +43,7 @@ pub struct Facts {
     /// The instruments, in the order of the cell's configuration; none for a scan read from a file.
     pub devices: Vec<DeviceFacts>,
     /// What the values were judged by.
-    pub limits: LimitFacts,
+    pub recipe: Recipe,
 }
 
 /// Size, spacing and noise of the scan, as estimated from the data.
@@ -69,46 +70,4 @@ pub struct DeviceFacts {
     pub identity: Identity,
     /// What was lost on the way; `None` for an instrument that cannot lose anything (a probe answers or fails).
     pub losses: Option<Losses>,
-}
-
-/// Limits of the deviations and the rule that judges them.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct LimitFacts {
-    /// How the uncertainty counts.
-    pub rule: Rule,
-    /// The limits of every edge that has none of its own.
-    pub all: EdgeLimits,
-    /// Limits of single edges, by id.
-    pub by_edge: BTreeMap<String, EdgeLimits>,
-}
-
-/// Lower and upper limits of one edge; `None` = not evaluated.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct EdgeLimits {
-    /// Of d1, mm.
-    pub d1_mm: Option<[f64; 2]>,
-    /// Of d2, mm.
-    pub d2_mm: Option<[f64; 2]>,
-    /// Of the included angle minus the nominal one, rad.
-    pub angle_deviation_rad: Option<[f64; 2]>,
-}
-
-/// How the uncertainty of a value counts when it is compared with a limit.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub enum Rule {
-    /// The value alone decides.
-    #[default]
-    Simple,
-    /// A limit within `k` standard uncertainties of the value leaves it undecided (ISO 14253-1:2017 with k = 2 and 95 %).
-    GuardBand {
-        /// Half the width of the uncertainty zone in standard uncertainties.
-        k: f64,
-    },
-}
-
-impl LimitFacts {
-    /// The limits that hold for the edge `id`.
-    pub fn of(&self, id: &str) -> EdgeLimits {
-        self.by_edge.get(id).copied().unwrap_or(self.all)
-    }
 }

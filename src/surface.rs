@@ -37,7 +37,9 @@ pub use scale::Scale;
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SurfaceError {
     /// Too few distinct points.
-    #[error("surface: {seen} distinct points, at least {LEAST_POINTS} needed; scan more of the part")]
+    #[error(
+        "surface: {seen} distinct points, at least {LEAST_POINTS} needed; scan more of the part"
+    )]
     TooFewPoints {
         /// How many there are.
         seen: usize,
@@ -179,7 +181,10 @@ impl<'a> Surface<'a> {
             let own = Box::new(Neighbors::new(&kept));
             (Cow::Owned(kept), Shared::Owned(own))
         } else {
-            (Cow::Borrowed(cloud.positions.as_slice()), Shared::Borrowed(neighbors))
+            (
+                Cow::Borrowed(cloud.positions.as_slice()),
+                Shared::Borrowed(neighbors),
+            )
         };
         Ok(Self {
             normals: vec![Vec3::ZERO; positions.len()],
@@ -215,7 +220,9 @@ impl<'a> Surface<'a> {
         (scratch, smoothing): (&Scratch, &Smoothing),
     ) -> Projected {
         let nearest = &outcome.nearest;
-        let foot = outcome.local.foot(nearest.position, 2.0 * smoothing.reach_mm);
+        let foot = outcome
+            .local
+            .foot(nearest.position, 2.0 * smoothing.reach_mm);
         let variance = foot
             .and_then(|foot| outcome.local.variance(&scratch.members, &foot, smoothing))
             .unwrap_or(f64::INFINITY);
@@ -303,12 +310,22 @@ impl<'a> Surface<'a> {
         let edge = arrangement.nearest_edge();
         let step = LINE_SPACING * self.scale.spacing_mm;
         let beside = |way: f64| edge.and_then(|e| arrangement.along(&e, way * step));
-        let meetings = [edge, beside(1.0), beside(-1.0), arrangement.nearest_corner()];
+        let meetings = [
+            edge,
+            beside(1.0),
+            beside(-1.0),
+            arrangement.nearest_corner(),
+        ];
         let mut local = flanks[nearest.flanks[0]].local.clone();
         scratch.members.clear();
         scratch.members.extend(hood.members(nearest.flanks[0]));
         if nearest.sheets == 1 {
-            let own = levin::project(&scratch.members, DVec3::ZERO, local.frame.normal, &smoothing);
+            let own = levin::project(
+                &scratch.members,
+                DVec3::ZERO,
+                local.frame.normal,
+                &smoothing,
+            );
             let near = self.scale.noise_mm + self.scale.floor_mm();
             if let Some((better, foot)) = own
                 && foot.position.distance(nearest.position) < near

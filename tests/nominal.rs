@@ -34,7 +34,8 @@ fn report() {
                     o["faces"],
                     n.edges.len(),
                     o["edges"],
-                    n.area_mm2() / f("area_mm2"), n.volume_mm3() / f("volume_mm3"),
+                    n.area_mm2() / f("area_mm2"),
+                    n.volume_mm3() / f("volume_mm3"),
                     n.edge_length_mm(),
                     f("edge_length_sum_mm"),
                     n.sharp_edges.len(),
@@ -72,8 +73,37 @@ fn report() {
 #[test]
 fn abc_list() {
     let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let n = Nominal::read(&root.join("abc/00009999_003df34c1a7b4dc2bd43c5f4_step_000.step")).unwrap();
-    for (i, f) in n.faces.iter().enumerate() { eprintln!("face {i} #{} {:?} {}", f.entity, f.surface.kind(), f.area_mm2()); }
-    for e in &n.edges { eprintln!("edge #{} {} {:?} {:?} len {}", e.entity, e.curve.kind(), e.range, e.faces, e.length_mm); }
-    for s in &n.sharp_edges { eprintln!("{} #{} {:?} {:?} len {} closed {} start {:?} turn {}", s.id, s.entity, s.faces, s.kind, s.length_mm, s.closed, s.station(&n, 0.0).point, s.turn_angle_rad(&n, 0.1).to_degrees()); }
+    let n =
+        Nominal::read(&root.join("abc/00009999_003df34c1a7b4dc2bd43c5f4_step_000.step")).unwrap();
+    for (i, f) in n.faces.iter().enumerate() {
+        eprintln!(
+            "face {i} #{} {:?} {}",
+            f.entity,
+            f.surface.kind(),
+            f.area_mm2()
+        );
+    }
+    for e in &n.edges {
+        eprintln!(
+            "edge #{} {} {:?} {:?} len {}",
+            e.entity,
+            e.curve.kind(),
+            e.range,
+            e.faces,
+            e.length_mm
+        );
+    }
+    for s in &n.sharp_edges {
+        eprintln!(
+            "{} #{} {:?} {:?} len {} closed {} start {:?} turn {}",
+            s.id,
+            s.entity,
+            s.faces,
+            s.kind,
+            s.length_mm,
+            s.closed,
+            s.station(&n, 0.0).point,
+            s.turn_angle_rad(&n, 0.1).to_degrees()
+        );
+    }
 }

@@ -34,7 +34,7 @@ impl Move {
     /// The first contact on the way, or nothing.
     ///
     /// Every ray through the ball along the motion meets the scene after a travel of its own; the ball does at the least of them.
-    /// A bundle finds where about, a shrinking pattern where exactly, and on a smooth surface whose distance is known the answer
+    /// A bundle finds where about, golden sections where exactly, and on a smooth surface whose distance is known the answer
     /// is then exact to rounding.
     pub fn first_contact(&self, scene: &Scene) -> Option<Contact> {
         let way = self.to - self.from;
@@ -91,10 +91,7 @@ impl Bundle<'_> {
         }
         let half = squared.sqrt();
         let origin = self.ball.from + self.u * a + self.v * b - self.direction * half;
-        let ray = Ray {
-            origin,
-            direction: self.direction,
-        };
+        let ray = Ray::along(origin, self.direction);
         let hit = self.scene.cast(&ray)?;
         let travel = if self.scene.contains(origin) {
             -2.0 * half
@@ -114,22 +111,25 @@ impl Bundle<'_> {
         }
     }
 
-    /// Eight directions that turn from round to round, so that no valley lies along none of them.
+    /// Golden sections within golden sections about the best ray: the travel is convex there when the body is.
     fn refine(&self, best: &mut Best) {
-        let mut step = self.ball.radius / f64::from(RINGS);
-        let mut turn = 0.0;
-        while step > 1e-9 * self.ball.radius {
-            let Some((_, _, [a, b])) = *best else { return };
-            let mut moved = false;
-            for k in 0..8 {
-                let (sin, cos) = (turn + TAU * f64::from(k) / 8.0).sin_cos();
-                moved |= self.improve(best, [a + step * cos, b + step * sin]);
+        let Some((_, _, around)) = *best else { return };
+        let reach = 1.5 * self.ball.radius / f64::from(RINGS);
+        let mut least = *best;
+        let at = |a: f64, b: f64, least: &mut Best| match self.travel([a, b]) {
+            Some((travel, _)) => {
+                self.improve(least, [a, b]);
+                travel
             }
-            turn += 2.399_963;
-            if !moved {
-                step *= 0.6;
-            }
-        }
+            // no contact there: worse than any, and worse the farther away, so that the search comes back
+            None => 1e9 + (a - around[0]).hypot(b - around[1]),
+        };
+        section([around[0] - reach, around[0] + reach], |a| {
+            section([around[1] - reach, around[1] + reach], |b| {
+                at(a, b, &mut least)
+            })
+        });
+        *best = least;
     }
 
     /// Newton's method on the distance of the centre, taken when it agrees with what the bundle found.
@@ -151,6 +151,25 @@ impl Bundle<'_> {
         }
         travel
     }
+}
+
+/// Least value of a convex function, by golden section down to 1e-12 of the interval.
+fn section([mut low, mut high]: [f64; 2], mut f: impl FnMut(f64) -> f64) -> f64 {
+    let golden = 0.5 * (5.0_f64.sqrt() - 1.0);
+    let (mut a, mut b) = (high - golden * (high - low), low + golden * (high - low));
+    let (mut fa, mut fb) = (f(a), f(b));
+    for _ in 0..58 {
+        if fa < fb {
+            (high, b, fb) = (b, a, fa);
+            a = high - golden * (high - low);
+            fa = f(a);
+        } else {
+            (low, a, fa) = (a, b, fb);
+            b = low + golden * (high - low);
+            fb = f(b);
+        }
+    }
+    fa.min(fb)
 }
 
 #[cfg(test)]

@@ -143,8 +143,11 @@ impl DemoCell {
             ("left", "SIM-LEFT", DVec3::new(-0.55, -0.45, 0.70), -1.0),
             ("right", "SIM-RIGHT", DVec3::new(0.55, 0.45, 0.70), 1.0),
         ];
+        // Both are on one stage, which runs until the slower of them has passed the part.
+        let profiles = sensors.map(|(_, _, from, _)| stand(from.normalize()).1);
+        let profiles = profiles[0].max(profiles[1]);
         let sensors = sensors.map(|(name, serial, from, camera_side)| {
-            let (stated, profiles) = stand(from.normalize());
+            let (stated, _) = stand(from.normalize());
             let [translation_mm, rotation_rad] = options.calibration_error;
             let error = Pose::normal_draw(&mut rng, translation_mm, rotation_rad);
             DemoSensor {

@@ -27,3 +27,5 @@ pub mod contact;
 pub mod grbl;
 
 pub mod demo_cell;
+
+pub mod devices;

@@ -10,6 +10,8 @@ mod polynomial;
 mod solid;
 mod span;
 mod surface;
+#[cfg(test)]
+mod tests;
 
 use glam::DVec3;
 

@@ -218,10 +218,10 @@ impl View {
         for &(dx, dy, weight) in rays {
             let across = DVec3::new(dx * sigma, dy * sigma, 0.0);
             let ray = self.optics.ray(column, self.columns, across);
-            let ray = Ray {
-                origin: scene_from_sensor.point(ray.origin),
-                direction: scene_from_sensor.direction(ray.direction),
-            };
+            let ray = Ray::along(
+                scene_from_sensor.point(ray.origin),
+                scene_from_sensor.direction(ray.direction),
+            );
             if let Some(part) = self.part_of_spot(&ray, scene_from_sensor, weight) {
                 returns.push(part);
             }

@@ -105,14 +105,22 @@ impl Reconstruct {
             on_corners: result.counts[1],
             spacing_mm: result.scale.spacing_mm,
             noise_mm: result.scale.noise_mm,
-            moved_rms_mm: if same_points { moved_rms(&scan.cloud, &result) } else { 0.0 },
+            moved_rms_mm: if same_points {
+                moved_rms(&scan.cloud, &result)
+            } else {
+                0.0
+            },
             findings: scan.findings,
             seconds,
         };
         self.say(&summary)
     }
 
-    fn work(&self, cloud: &PointCloud, neighbors: &Neighbors) -> std::result::Result<Result, Failure> {
+    fn work(
+        &self,
+        cloud: &PointCloud,
+        neighbors: &Neighbors,
+    ) -> std::result::Result<Result, Failure> {
         if let Some(spacing_mm) = self.resample {
             resampled(cloud, neighbors, spacing_mm)
         } else if self.smooth {
@@ -174,14 +182,22 @@ fn sharp(cloud: &PointCloud, neighbors: &Neighbors) -> std::result::Result<Resul
 
 fn smooth(cloud: &PointCloud, neighbors: &Neighbors) -> std::result::Result<Result, SurfaceError> {
     let scale = Scale::of(cloud, neighbors);
-    let surface = SmoothSurface::new(&cloud.positions, neighbors, Degree::Two, scale.smoothing_mm());
+    let surface = SmoothSurface::new(
+        &cloud.positions,
+        neighbors,
+        Degree::Two,
+        scale.smoothing_mm(),
+    );
     let points = surface.project_all();
     Ok(Result {
         counts: [0, 0],
         projected: points.iter().flatten().count(),
         flags: points.iter().map(|p| u8::from(p.is_some())).collect(),
         flag_name: "projected",
-        normals: points.iter().map(|p| p.map_or(Vec3::ZERO, |p| p.1.as_vec3())).collect(),
+        normals: points
+            .iter()
+            .map(|p| p.map_or(Vec3::ZERO, |p| p.1.as_vec3()))
+            .collect(),
         positions: (points.iter().zip(&cloud.positions))
             .map(|(p, old)| p.map_or(*old, |p| p.0))
             .collect(),
@@ -214,9 +230,8 @@ fn moved_rms(cloud: &PointCloud, result: &Result) -> f64 {
 }
 
 fn write(path: &std::path::Path, result: &Result) -> std::result::Result<(), Failure> {
-    let part = |axis: usize| -> Vec<f64> {
-        result.normals.iter().map(|n| f64::from(n[axis])).collect()
-    };
+    let part =
+        |axis: usize| -> Vec<f64> { result.normals.iter().map(|n| f64::from(n[axis])).collect() };
     let (nx, ny, nz) = (part(0), part(1), part(2));
     let columns = [
         Column::F64("nx", &nx),
@@ -224,5 +239,6 @@ fn write(path: &std::path::Path, result: &Result) -> std::result::Result<(), Fai
         Column::F64("nz", &nz),
         Column::U8(result.flag_name, &result.flags),
     ];
-    write_ply(path, &result.positions, &columns, Encoding::LittleEndian).map_err(|e| Failure::Io(e.into()))
+    write_ply(path, &result.positions, &columns, Encoding::LittleEndian)
+        .map_err(|e| Failure::Io(e.into()))
 }

@@ -218,17 +218,14 @@ impl Workshop {
             let mut best: Option<(f64, usize, usize, Fit)> = None;
             for i in 0..fits.len() {
                 for j in 0..i {
-                    let (a, b) = (fits[i].0, fits[j].0);
-                    let Some(union) = fit(&self.points, variance, |p| {
-                        self.labels[p] == a || self.labels[p] == b
-                    }) else {
+                    let Some((parts, whole)) = self.split(&fits[i], &fits[j], variance) else {
                         continue;
                     };
-                    let change = union.criterion(variance)
-                        - fits[i].1.criterion(variance)
-                        - fits[j].1.criterion(variance);
+                    let change = whole.criterion(variance)
+                        - parts[0].criterion(variance)
+                        - parts[1].criterion(variance);
                     if best.as_ref().is_none_or(|x| change < x.0) {
-                        best = Some((change, i, j, union));
+                        best = Some((change, i, j, whole));
                     }
                 }
             }
@@ -248,6 +245,37 @@ impl Workshop {
             fits.remove(i);
         }
         (fits, doubt)
+    }
+
+    /// The two surfaces fitted anew after giving each of their points to the side of the crease on which it lies, and one surface
+    /// through all of these points.
+    ///
+    /// The side is that of the surface which halves the angle: unlike the nearer of the two, it does not select by noise.
+    fn split(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<([Fit; 2], Fit)> {
+        let mut parts = [one.1, other.1];
+        let either = |i: usize| self.labels[i] == one.0 || self.labels[i] == other.0;
+        let mut facing = [0.0; 2];
+        for (i, p) in self.points.iter().enumerate() {
+            if self.labels[i] == one.0 {
+                facing[0] += parts[1].surface.distance(*p);
+            } else if self.labels[i] == other.0 {
+                facing[1] += parts[0].surface.distance(*p);
+            }
+        }
+        let facing = facing.map(f64::signum);
+        for _ in 0..2 {
+            let [a, b] = [parts[0].surface, parts[1].surface];
+            let second = |i: usize| {
+                let p = self.points[i];
+                facing[0] * b.distance(p) < facing[1] * a.distance(p)
+            };
+            parts = [
+                fit(&self.points, variance, |i| either(i) && !second(i))?,
+                fit(&self.points, variance, |i| either(i) && second(i))?,
+            ];
+        }
+        let whole = fit(&self.points, variance, either)?;
+        Some((parts, whole))
     }
 
     /// The nearest believable crease between two of the surfaces.
@@ -272,37 +300,10 @@ impl Workshop {
         Some(crease)
     }
 
-    /// The crease between two surfaces: their intersection, after giving the points in doubt to the side they lie on.
+    /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt.
     fn crease(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<Crease> {
-        let mut surfaces = [one.1.surface, other.1.surface];
-        let mut fits = [one.1, other.1];
-        let doubtful = 6.25 * variance;
-        for _ in 0..2 {
-            let (e, t) = foot(&surfaces[0], &surfaces[1], DVec3::ZERO)?;
-            let across = self.across([one.0, other.0], &surfaces, (e, t))?;
-            let side = |p: DVec3| usize::from((p - e).dot(across) > 0.0);
-            let curved = surfaces.iter().any(Surface::is_curved);
-            let member = |i: usize, s: usize| -> bool {
-                let label = self.labels[i];
-                if label != one.0 && label != other.0 {
-                    return false;
-                }
-                let p = self.points[i];
-                let d = [
-                    surfaces[0].distance(p).powi(2),
-                    surfaces[1].distance(p).powi(2),
-                ];
-                if d[0] < doubtful && d[1] < doubtful {
-                    let local = !curved || p.distance_squared(e) < 2.25;
-                    return local && side(p) == s;
-                }
-                s == usize::from(d[1] < d[0])
-            };
-            for s in 0..2 {
-                fits[s] = fit(&self.points, variance, |i| member(i, s))?;
-            }
-            surfaces = [fits[0].surface, fits[1].surface];
-        }
+        let (fits, _) = self.split(one, other, variance)?;
+        let surfaces = [fits[0].surface, fits[1].surface];
         let (e, tangent) = foot(&surfaces[0], &surfaces[1], DVec3::ZERO)?;
         if e.length_squared() > FAR * FAR {
             return None;
@@ -312,15 +313,24 @@ impl Workshop {
         let cos = across[0].dot(across[1]);
         let turn = (-cos).clamp(-1.0, 1.0).acos();
         let sine = normals[0].cross(normals[1]).length().max(1e-6);
-        let spread: f64 = fits
-            .iter()
-            .map(|f| if f.surface.is_curved() { 9.0 } else { 4.0 } / f.count as f64)
-            .sum();
-        (turn > LEAST_TURN && self.supported([one.0, other.0], e)).then_some(Crease {
+        // At the end of a stretch of length L with n points a line is good to 2 sigma / sqrt n and its slope to sqrt 12 sigma / (L sqrt n);
+        // a parabola to 3 sigma / sqrt n and sqrt 192 sigma / (L sqrt n).
+        let (mut place, mut slope) = (0.0, 0.0);
+        for f in &fits {
+            let n = f.count as f64;
+            let length2 = (n / 1.5).max(1.0);
+            let bent = f.surface.is_curved();
+            place += if bent { 9.0 } else { 4.0 } / n;
+            slope += if bent { 192.0 } else { 12.0 } / (n * length2);
+        }
+        let turn_sd = (variance * slope).sqrt();
+        let believable =
+            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        believable.then_some(Crease {
             foot: e,
             tangent,
             turn,
-            sd: (variance * spread).sqrt() / sine,
+            sd: (variance * place).sqrt() / sine,
             corner: None,
         })
     }
@@ -346,17 +356,6 @@ impl Workshop {
             into[s] = direction * lean.signum();
         }
         Some(into)
-    }
-
-    /// Normal of the plane that halves the angle between the surfaces, pointing to the second.
-    fn across(
-        &self,
-        labels: [u8; 2],
-        surfaces: &[Surface; 2],
-        at: (DVec3, DVec3),
-    ) -> Option<DVec3> {
-        let [a, b] = self.directions(labels, surfaces, at)?;
-        (b - a).try_normalize()
     }
 
     /// Whether both surfaces have points near the foot: a crease is where surfaces meet, not where their continuations do.

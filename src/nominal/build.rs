@@ -294,7 +294,11 @@ impl<'a> Builder<'a> {
                     s.point(u, v).distance(*p)
                 };
                 let lean: f64 = points.map(|p| miss(&surface, p) - miss(&inner, p)).sum();
-                if lean > 0.0 { (inner, true) } else { (surface, false) }
+                if lean > 0.0 {
+                    (inner, true)
+                } else {
+                    (surface, false)
+                }
             }
             other => (other, false),
         }

@@ -301,13 +301,11 @@ impl Shapes<'_> {
                 frame: frame()?,
                 radius_mm: self.length(&r, 2)?,
             },
-            "TOROIDAL_SURFACE" | "DEGENERATE_TOROIDAL_SURFACE" => {
-                Surface::Torus {
-                    frame: frame()?,
-                    major_mm: self.length(&r, 2)?,
-                    minor_mm: self.length(&r, 3)?,
-                }
-            }
+            "TOROIDAL_SURFACE" | "DEGENERATE_TOROIDAL_SURFACE" => Surface::Torus {
+                frame: frame()?,
+                major_mm: self.length(&r, 2)?,
+                minor_mm: self.length(&r, 3)?,
+            },
             "SURFACE_OF_LINEAR_EXTRUSION" => {
                 let profile = self.curve_at(r.reference(1)?, depth + 1)?;
                 return extruded(id, profile, self.vector(r.reference(2)?)?.normalize());

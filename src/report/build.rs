@@ -5,10 +5,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use glam::DVec3;
 
+use super::Facts;
 use super::characteristic::{Criterion, characteristic, samples, spread};
 use super::conclusion;
 use super::wire::{self, Quantity, Report, Status};
-use super::{Facts, LimitFacts, Rule};
+use crate::inspect::recipe::{EdgeKey, Limits, Recipe, Rule};
 use crate::inspect::result::{Alignment, EdgeResult, Inspection, StationResult, Verdict};
 use crate::nominal::EdgeKind;
 
@@ -22,7 +23,12 @@ impl Report {
         let edges: Vec<_> = inspection
             .edges
             .iter()
-            .map(|edge| edge_from_result(edge, &facts.limits, &mut findings))
+            .enumerate()
+            .map(|(index, edge)| {
+                let limits = limits_of(&facts.recipe, index, edge);
+                let rule = facts.recipe.rule;
+                edge_from_result(edge, (&limits, rule), &mut findings)
+            })
             .collect();
         let alignment = alignment_from_result(&inspection.alignment);
         // A good alignment makes no part OK: where no value was judged, nothing was.
@@ -49,7 +55,7 @@ impl Report {
             verdict,
             reason: String::new(),
             advice: String::new(),
-            recipe: recipe_from_facts(&facts.limits),
+            recipe: recipe_on_the_wire(&facts.recipe),
             scan: scan_from_facts(facts),
             devices: devices_from_facts(facts),
             alignment,
@@ -108,20 +114,34 @@ fn seconds_by_stage(seconds: &[(&'static str, f64)]) -> indexmap::IndexMap<Strin
     by_stage
 }
 
-fn recipe_from_facts(facts: &LimitFacts) -> wire::Recipe {
-    let (rule, guard_band_k) = match facts.rule {
+fn recipe_on_the_wire(recipe: &Recipe) -> wire::Recipe {
+    let (rule, guard_band_k) = match recipe.rule {
         Rule::Simple => (wire::Rule::Simple, None),
-        Rule::GuardBand { k } => (wire::Rule::GuardBand, finite(k)),
+        Rule::GuardBand(k) => (wire::Rule::GuardBand, finite(k)),
     };
+    let [d1_mm, d2_mm] = recipe.limits.d_mm.map(finite_limits);
     wire::Recipe {
         rule,
         guard_band_k,
         limits: wire::Limits {
-            d1_mm: finite_limits(facts.all.d1_mm),
-            d2_mm: finite_limits(facts.all.d2_mm),
-            angle_deviation_deg: limits_in_degrees(facts.all.angle_deviation_rad),
+            d1_mm,
+            d2_mm,
+            angle_deviation_deg: limits_in_degrees(recipe.limits.angle_rad),
         },
+        minimum_coverage: finite(recipe.minimum_coverage),
+        u_calibration_mm: finite(recipe.u_calibration_mm),
+        u_calibration_deg: degrees(recipe.u_calibration_rad),
     }
+}
+
+/// The limits of an edge that the recipe may know by its entity, by its number or, once named, by its name.
+fn limits_of(recipe: &Recipe, index: usize, edge: &EdgeResult) -> Limits {
+    let number = format!("e{}", index + 1);
+    let own = recipe.edges.iter().find(|own| match &own.key {
+        EdgeKey::Entity(entity) => *entity == edge.nominal_entity,
+        EdgeKey::Id(id) => *id == edge.id || *id == number,
+    });
+    own.map_or(recipe.limits, |own| own.limits)
 }
 
 fn finite_limits(limits: Option<[f64; 2]>) -> Option<[f64; 2]> {
@@ -203,7 +223,7 @@ fn alignment_from_result(alignment: &Alignment) -> wire::Alignment {
 
 fn edge_from_result(
     edge: &EdgeResult,
-    limits: &LimitFacts,
+    criteria: (&Limits, Rule),
     findings: &mut Vec<String>,
 ) -> wire::Edge {
     let mut stations = Vec::with_capacity(edge.stations.len());
@@ -222,7 +242,7 @@ fn edge_from_result(
             )),
         }
     }
-    let (summary, characteristics) = evaluate(&edge.id, &stations, limits);
+    let (summary, characteristics) = evaluate(&edge.id, &stations, criteria);
     wire::Edge {
         id: edge.id.clone(),
         nominal_entity: edge.nominal_entity,
@@ -243,16 +263,14 @@ fn edge_from_result(
 fn evaluate(
     id: &str,
     stations: &[wire::Station],
-    all_limits: &LimitFacts,
+    (limits, rule): (&Limits, Rule),
 ) -> (wire::Summary, Vec<wire::Characteristic>) {
-    let rule = all_limits.rule;
-    let limits = all_limits.of(id);
     let quantities = [
-        (Quantity::D1, finite_limits(limits.d1_mm)),
-        (Quantity::D2, finite_limits(limits.d2_mm)),
+        (Quantity::D1, finite_limits(limits.d_mm[0])),
+        (Quantity::D2, finite_limits(limits.d_mm[1])),
         (
             Quantity::AngleDeviation,
-            limits_in_degrees(limits.angle_deviation_rad),
+            limits_in_degrees(limits.angle_rad),
         ),
     ];
     let values = quantities.map(|(quantity, _)| samples(stations, quantity));

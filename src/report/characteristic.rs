@@ -1,7 +1,7 @@
 //! Values along an edge put together: spread, worst station, verdict against limits.
 
-use super::Rule;
 use super::wire::{Characteristic, Quantity, Spread, Station, Status};
+use crate::inspect::recipe::Rule;
 
 /// One quantity of one station, in the unit of the wire.
 #[derive(Debug, Clone, Copy)]
@@ -60,8 +60,8 @@ pub fn judge(value: f64, u: Option<f64>, criterion: Criterion) -> Status {
     };
     let zone = match (criterion.rule, u) {
         (Rule::Simple, _) => 0.0,
-        (Rule::GuardBand { k }, Some(u)) => k * u,
-        (Rule::GuardBand { .. }, None) => return Status::NotDecidable,
+        (Rule::GuardBand(k), Some(u)) => k * u,
+        (Rule::GuardBand(_), None) => return Status::NotDecidable,
     };
     if value - zone > upper || value + zone < lower {
         Status::NotOk
@@ -138,7 +138,7 @@ mod tests {
         Criterion { limits, rule }
     }
 
-    const BAND: Rule = Rule::GuardBand { k: 2.0 };
+    const BAND: Rule = Rule::GuardBand(2.0);
 
     #[test]
     fn the_guard_band_splits_the_line_into_five() {

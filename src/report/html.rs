@@ -256,7 +256,7 @@ fn write_view(out: &mut String, drawing: &Drawing<'_>) -> fmt::Result {
         ("run s-undefined", "not judged"),
         ("run s-gap", "not measured: dotted"),
         ("hair", "deviation, enlarged"),
-        ("extra", "not in the nominal"),
+        ("extra", "not in the nominal: red, dotted"),
     ] {
         write!(
             out,

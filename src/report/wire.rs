@@ -96,6 +96,12 @@ pub struct Recipe {
     pub guard_band_k: Option<f64>,
     /// Limits of every edge that has none of its own.
     pub limits: Limits,
+    /// Share of an edge that must be measured for it to be decidable, 0 to 1.
+    pub minimum_coverage: Option<f64>,
+    /// Standard uncertainty of d1 and d2 from the calibration of the sensors, part of every u_d.
+    pub u_calibration_mm: Option<f64>,
+    /// Standard uncertainty of the included angle from the calibration of the sensors.
+    pub u_calibration_deg: Option<f64>,
 }
 
 /// How the uncertainty of a value counts against a limit.

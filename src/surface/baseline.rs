@@ -18,7 +18,12 @@ pub struct SmoothSurface<'a> {
 
 impl<'a> SmoothSurface<'a> {
     /// The surface through `positions` with the Gaussian weight exp(-d²/h²).
-    pub fn new(positions: &'a [DVec3], neighbors: &'a Neighbors, degree: Degree, h_mm: f64) -> Self {
+    pub fn new(
+        positions: &'a [DVec3],
+        neighbors: &'a Neighbors,
+        degree: Degree,
+        h_mm: f64,
+    ) -> Self {
         Self {
             positions,
             neighbors,
@@ -48,7 +53,10 @@ impl<'a> SmoothSurface<'a> {
 
     /// All points of the cloud: position, unit normal, or `None` where a point was not projected.
     pub fn project_all(&self) -> Vec<Option<(DVec3, DVec3)>> {
-        self.positions.par_iter().map(|p| self.project(*p)).collect()
+        self.positions
+            .par_iter()
+            .map(|p| self.project(*p))
+            .collect()
     }
 }
 

@@ -111,7 +111,9 @@ pub fn reconstruct(
         };
         let suspicious = prepare(&mut surface, Some(sink));
         let mut later = Vec::with_capacity(suspicious.len());
-        features.land(&surface, cloud, (&suspicious, false), |landed| later.push(landed));
+        features.land(&surface, cloud, (&suspicious, false), |landed| {
+            later.push(landed)
+        });
         let mut normals = std::mem::take(&mut surface.normals);
         for landed in later {
             let index = landed.index as usize;
@@ -224,11 +226,17 @@ impl Features {
     ) {
         for block in indices.chunks(BLOCK) {
             let landed = in_parallel(block, |index, scratch| {
-                land_one(surface, cloud.positions[index as usize], try_smooth, scratch)
+                land_one(
+                    surface,
+                    cloud.positions[index as usize],
+                    try_smooth,
+                    scratch,
+                )
             });
             for (&index, (nearest, meetings)) in block.iter().zip(landed) {
                 let p = cloud.positions[index as usize];
-                self.lines.extend(meetings.iter().flatten().map(|m| line_point(p, m)));
+                self.lines
+                    .extend(meetings.iter().flatten().map(|m| line_point(p, m)));
                 let Some(nearest) = nearest else {
                     put(Landed {
                         index,
@@ -290,7 +298,16 @@ fn land_one(
     let longest = surface.longest_way_mm();
     // Lines are sampled from as far as the flanks' own points reach beyond doubt.
     let near = longest + 1.5 * surface.scale.spacing_mm;
-    let meetings = outcome.meetings.map(|m| m.filter(|m| m.position.length() < near));
+    let meetings = outcome
+        .meetings
+        .map(|m| m.filter(|m| m.position.length() < near));
     let nearest = Some(outcome.nearest).filter(|n| n.position.length() <= longest);
-    (nearest, if nearest.is_some() { meetings } else { Meetings::default() })
+    (
+        nearest,
+        if nearest.is_some() {
+            meetings
+        } else {
+            Meetings::default()
+        },
+    )
 }

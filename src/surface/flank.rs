@@ -110,7 +110,12 @@ impl Neighborhood {
     }
 
     /// Grows a flank from a seed in three strides; labels its members. `None`, and nothing labelled, where it finds too few.
-    fn grow(&mut self, seed: usize, label: u8, (scale, smoothing): (&Scale, &Smoothing)) -> Option<Flank> {
+    fn grow(
+        &mut self,
+        seed: usize,
+        label: u8,
+        (scale, smoothing): (&Scale, &Smoothing),
+    ) -> Option<Flank> {
         let start = self.points[seed];
         let radius = self.radius_mm();
         let frame = LocalFrame::new(start, self.normals[seed]);
@@ -126,10 +131,12 @@ impl Neighborhood {
             let mut last = Vec::new();
             for i in 0..self.points.len() {
                 let far = self.points[i].distance(start);
-                let tolerance = 3.0 * scale.noise_mm + scale.floor_mm() + bend * far * far / scale.spacing_mm;
+                let tolerance =
+                    3.0 * scale.noise_mm + scale.floor_mm() + bend * far * far / scale.spacing_mm;
                 if self.labels[i] == NONE
                     && far < reach
-                    && local.distance(self.points[i]).abs() < tolerance.min(3.0 * scale.noise_mm + 0.4 * scale.spacing_mm)
+                    && local.distance(self.points[i]).abs()
+                        < tolerance.min(3.0 * scale.noise_mm + 0.4 * scale.spacing_mm)
                     && self.agrees(i, &local)
                 {
                     self.members.push(self.points[i]);
@@ -143,7 +150,9 @@ impl Neighborhood {
             let centre = self.members.iter().sum::<DVec3>() / self.members.len() as f64;
             let normal = weighted_normal(&self.members, centre, wide.h_mm)?;
             let frame = LocalFrame::new(centre, normal);
-            let Some(polynomial) = fit(&self.members, &frame, &wide) else { break };
+            let Some(polynomial) = fit(&self.members, &frame, &wide) else {
+                break;
+            };
             local = LocalSurface { frame, polynomial };
             flank = Some((local.clone(), last));
         }
@@ -157,7 +166,8 @@ impl Neighborhood {
     /// Whether neighbour `i`'s own normal speaks for the surface, or says nothing.
     fn agrees(&self, i: usize, local: &LocalSurface) -> bool {
         const COS_35_DEGREES: f64 = 0.82;
-        self.trust[i] < 0.4 || self.normals[i].dot(local.normal_near(self.points[i])).abs() > COS_35_DEGREES
+        self.trust[i] < 0.4
+            || self.normals[i].dot(local.normal_near(self.points[i])).abs() > COS_35_DEGREES
     }
 
     /// Gives every neighbour to the flank that explains its position and its normal best.
@@ -167,7 +177,9 @@ impl Neighborhood {
             let mut best = (NONE, 16.0);
             for (label, flank) in flanks.iter().enumerate() {
                 let off = flank.local.distance(self.points[i]) / width;
-                let cosine = self.normals[i].dot(flank.local.normal_near(self.points[i])).abs();
+                let cosine = self.normals[i]
+                    .dot(flank.local.normal_near(self.points[i]))
+                    .abs();
                 // An angle of 30 degrees counts as much as a distance of one sigma, as far as the normal is trusted.
                 let turn = self.trust[i] * (1.0 - cosine.min(1.0)) / 0.134;
                 let cost = off * off + turn;
@@ -180,7 +192,11 @@ impl Neighborhood {
     }
 
     /// Fits every flank to its neighbours, weighted around the query; flanks that too few determine are dropped.
-    fn refit(&mut self, flanks: Vec<Flank>, (scale, smoothing): (&Scale, &Smoothing)) -> Vec<Flank> {
+    fn refit(
+        &mut self,
+        flanks: Vec<Flank>,
+        (scale, smoothing): (&Scale, &Smoothing),
+    ) -> Vec<Flank> {
         let mut kept = Vec::with_capacity(flanks.len());
         for (label, old) in flanks.into_iter().enumerate() {
             self.members.clear();
@@ -201,9 +217,16 @@ impl Neighborhood {
         kept
     }
 
-    fn fit_members(&self, old: &Flank, (scale, smoothing): (&Scale, &Smoothing)) -> Option<LocalSurface> {
+    fn fit_members(
+        &self,
+        old: &Flank,
+        (scale, smoothing): (&Scale, &Smoothing),
+    ) -> Option<LocalSurface> {
         let reach = self.radius_mm() * 2.0;
-        let nearest = old.local.foot(DVec3::ZERO, reach).map_or(DVec3::ZERO, |f| f.position);
+        let nearest = old
+            .local
+            .foot(DVec3::ZERO, reach)
+            .map_or(DVec3::ZERO, |f| f.position);
         let middle = self.members.iter().sum::<DVec3>() / self.members.len() as f64;
         // The weights stand around the query's place on the flank, but not so far out that none of its points has any.
         let out = nearest - middle;
@@ -214,7 +237,10 @@ impl Neighborhood {
             return None;
         }
         let frame = LocalFrame::new(centre, normal);
-        let frame = LocalFrame::new(centre + normal * plane_offset(&self.members, &frame, smoothing.h_mm), normal);
+        let frame = LocalFrame::new(
+            centre + normal * plane_offset(&self.members, &frame, smoothing.h_mm),
+            normal,
+        );
         let polynomial = fit(&self.members, &frame, smoothing)?;
         Some(LocalSurface { frame, polynomial })
     }
@@ -245,7 +271,8 @@ fn determined(points: &[DVec3], normal: DVec3, scale: &Scale) -> bool {
     }
     let least = 0.5 * (uu + vv) - (0.25 * (uu - vv) * (uu - vv) + uv * uv).sqrt();
     let sigma = scale.noise_mm + scale.floor_mm();
-    least > 25.0 * sigma * sigma && least > 0.05 * scale.spacing_mm * scale.spacing_mm * points.len() as f64
+    least > 25.0 * sigma * sigma
+        && least > 0.05 * scale.spacing_mm * scale.spacing_mm * points.len() as f64
 }
 
 /// The flanks around a query with their relations: which trims which.
@@ -268,7 +295,10 @@ impl<'a> Arrangement<'a> {
             hood,
             flanks,
             scale,
-            feet: flanks.iter().map(|f| f.local.foot(DVec3::ZERO, reach_mm)).collect(),
+            feet: flanks
+                .iter()
+                .map(|f| f.local.foot(DVec3::ZERO, reach_mm))
+                .collect(),
             sides: [[0.0; FLANKS_MAX]; FLANKS_MAX],
             gap_mm: 2.0 * hood.spacing_mm().max(scale.spacing_mm) + scale.noise_mm,
             reach_mm,
@@ -320,7 +350,9 @@ impl<'a> Arrangement<'a> {
         (0..self.flanks.len()).filter(|b| !on.contains(b)).all(|b| {
             on.iter().all(|&a| {
                 let side = self.sides[a][b];
-                side == 0.0 || !self.present(b, x) || side * self.flanks[b].local.distance(x) > -slack
+                side == 0.0
+                    || !self.present(b, x)
+                    || side * self.flanks[b].local.distance(x) > -slack
             })
         })
     }
@@ -331,7 +363,11 @@ impl<'a> Arrangement<'a> {
         let edge = self.nearest_edge();
         let corner = self.nearest_corner();
         let length = |n: &Option<Nearest>| n.map_or(f64::INFINITY, |n| n.position.length());
-        let mut best = if length(&edge) < length(&face) { edge } else { face };
+        let mut best = if length(&edge) < length(&face) {
+            edge
+        } else {
+            face
+        };
         let snap = 1.5 * self.scale.noise_mm + 5.0 * self.scale.floor_mm();
         if let (Some(at), Some(on_edge)) = (best, edge)
             && at.position.distance(on_edge.position) < snap
@@ -375,7 +411,9 @@ impl<'a> Arrangement<'a> {
                 if self.sides[a][b] == 0.0 {
                     continue;
                 }
-                let Some(met) = self.meeting([a, b], DVec3::ZERO) else { continue };
+                let Some(met) = self.meeting([a, b], DVec3::ZERO) else {
+                    continue;
+                };
                 if best.is_none_or(|e| e.position.length() > met.position.length()) {
                     best = Some(met);
                 }
@@ -399,7 +437,10 @@ impl<'a> Arrangement<'a> {
     /// The place on the same feature line as `edge`, `step_mm` along it.
     pub fn along(&self, edge: &Nearest, step_mm: f64) -> Option<Nearest> {
         let tangent = edge.normals[0].cross(edge.normals[1]).normalize_or_zero();
-        self.meeting([edge.flanks[0], edge.flanks[1]], edge.position + tangent * step_mm)
+        self.meeting(
+            [edge.flanks[0], edge.flanks[1]],
+            edge.position + tangent * step_mm,
+        )
     }
 
     /// The nearest place where three flanks meet, of which at least two pairs trim each other.
@@ -416,7 +457,9 @@ impl<'a> Arrangement<'a> {
                     if related < 2 {
                         continue;
                     }
-                    let Some((x, normals)) = self.meet_three([a, b, c]) else { continue };
+                    let Some((x, normals)) = self.meet_three([a, b, c]) else {
+                        continue;
+                    };
                     if best.is_some_and(|e| e.position.length() <= x.length())
                         || [a, b, c].iter().any(|&f| !self.present(f, x))
                     {
@@ -449,7 +492,8 @@ impl<'a> Arrangement<'a> {
                 return None;
             }
             let (ca, cb) = (na.dot(fa.position - start), nb.dot(fb.position - start));
-            let next = start + na * ((ca - g * cb) / sine_squared) + nb * ((cb - g * ca) / sine_squared);
+            let next =
+                start + na * ((ca - g * cb) / sine_squared) + nb * ((cb - g * ca) / sine_squared);
             normals = (na, nb);
             let moved = next.distance(x);
             x = next;

@@ -138,7 +138,11 @@ pub(crate) fn approximate(
 }
 
 /// The polynomial over `frame`, weighted around its origin (Weber 2011, §2.3.2.2, eq. 2.18).
-pub(crate) fn fit(points: &[DVec3], frame: &LocalFrame, smoothing: &Smoothing) -> Option<Polynomial> {
+pub(crate) fn fit(
+    points: &[DVec3],
+    frame: &LocalFrame,
+    smoothing: &Smoothing,
+) -> Option<Polynomial> {
     equations(points, frame, smoothing).solve(smoothing.sigma_mm)
 }
 
@@ -173,7 +177,8 @@ impl LocalSurface {
     /// Unit normal above or below `p`.
     pub fn normal_near(&self, p: DVec3) -> DVec3 {
         let at = self.frame.inside(p);
-        self.frame.direction(self.polynomial.jet(at.x, at.y).normal())
+        self.frame
+            .direction(self.polynomial.jet(at.x, at.y).normal())
     }
 
     /// Variance, mm², of the surface's height at `foot` under noise of `sigma_mm` along the normal: that of a linear estimate with
@@ -196,7 +201,10 @@ impl LocalSurface {
             sum += influence * influence;
         }
         // Heights run along the frame's normal, the surface's own is tilted against it.
-        Some(sum * smoothing.sigma_mm * smoothing.sigma_mm / (1.0 + foot.jet.gradient.length_squared()))
+        Some(
+            sum * smoothing.sigma_mm * smoothing.sigma_mm
+                / (1.0 + foot.jet.gradient.length_squared()),
+        )
     }
 }
 

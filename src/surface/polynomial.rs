@@ -66,18 +66,7 @@ impl LocalFrame {
 /// The monomials up to degree three at (x, y), lower degrees first.
 pub(crate) fn monomials(x: f64, y: f64) -> [f64; TERMS_MAX] {
     let (xx, xy, yy) = (x * x, x * y, y * y);
-    [
-        1.0,
-        x,
-        y,
-        xx,
-        xy,
-        yy,
-        xx * x,
-        xx * y,
-        x * yy,
-        yy * y,
-    ]
+    [1.0, x, y, xx, xy, yy, xx * x, xx * y, x * yy, yy * y]
 }
 
 /// Normal equations of a weighted fit, in coordinates divided by `scale_mm` so that their condition does not depend on the unit.
@@ -303,8 +292,16 @@ impl Polynomial {
         let (x, y) = (x * s, y * s);
         let c = &self.coefficients;
         let gradient = DVec2::new(
-            c[1] + 2.0 * c[3] * x + c[4] * y + 3.0 * c[6] * x * x + 2.0 * c[7] * x * y + c[8] * y * y,
-            c[2] + c[4] * x + 2.0 * c[5] * y + c[7] * x * x + 2.0 * c[8] * x * y + 3.0 * c[9] * y * y,
+            c[1] + 2.0 * c[3] * x
+                + c[4] * y
+                + 3.0 * c[6] * x * x
+                + 2.0 * c[7] * x * y
+                + c[8] * y * y,
+            c[2] + c[4] * x
+                + 2.0 * c[5] * y
+                + c[7] * x * x
+                + 2.0 * c[8] * x * y
+                + 3.0 * c[9] * y * y,
         );
         let second = [
             2.0 * c[3] + 6.0 * c[6] * x + 2.0 * c[7] * y,
@@ -365,7 +362,8 @@ impl Jet {
         let [fxx, fxy, fyy] = self.second;
         let w2 = 1.0 + fx * fx + fy * fy;
         let w = w2.sqrt();
-        let mean = ((1.0 + fy * fy) * fxx - 2.0 * fx * fy * fxy + (1.0 + fx * fx) * fyy) / (2.0 * w2 * w);
+        let mean =
+            ((1.0 + fy * fy) * fxx - 2.0 * fx * fy * fxy + (1.0 + fx * fx) * fyy) / (2.0 * w2 * w);
         let gauss = (fxx * fyy - fxy * fxy) / (w2 * w2);
         let root = (mean * mean - gauss).max(0.0).sqrt();
         if mean >= 0.0 {

@@ -73,7 +73,11 @@ impl Resampled {
     }
 }
 
-fn add_lines(first: &Reconstruction, spacing_mm: f64, (grid, out): (&mut Grid<()>, &mut Resampled)) {
+fn add_lines(
+    first: &Reconstruction,
+    spacing_mm: f64,
+    (grid, out): (&mut Grid<()>, &mut Resampled),
+) {
     for line in &first.lines {
         if grid.take(line.position, 0.4 * spacing_mm) {
             out.push(line.position, line.normals[0], line.place);
@@ -92,7 +96,11 @@ fn fill(surface: &Surface, apart: f64, (grid, out): (&mut Grid<()>, &mut Resampl
             .flat_map_iter(|(p, n)| around(surface, *p, *n, apart))
             .collect();
         for (position, normal, place) in candidates {
-            let distance = if place == Place::Face { apart } else { 0.5 * apart };
+            let distance = if place == Place::Face {
+                apart
+            } else {
+                0.5 * apart
+            };
             if grid.take(position, distance) {
                 out.push(position, normal, place);
             }
@@ -103,7 +111,10 @@ fn fill(surface: &Surface, apart: f64, (grid, out): (&mut Grid<()>, &mut Resampl
 
 /// Six places around `p` on the surface.
 fn around(surface: &Surface, p: DVec3, normal: Vec3, apart: f64) -> Vec<(DVec3, Vec3, Place)> {
-    let (u, v) = normal.as_dvec3().normalize_or(DVec3::Z).any_orthonormal_pair();
+    let (u, v) = normal
+        .as_dvec3()
+        .normalize_or(DVec3::Z)
+        .any_orthonormal_pair();
     (0..6)
         .filter_map(|k| {
             let (sine, cosine) = (f64::from(k) * std::f64::consts::FRAC_PI_3).sin_cos();

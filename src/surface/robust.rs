@@ -26,7 +26,10 @@ pub(crate) fn robust_normal(points: &[DVec3], scale: &Scale) -> Option<(DVec3, f
     // A surface may leave its tangent plane like a cylinder of twenty spacings' radius.
     let bend = 0.025 / scale.spacing_mm;
     let width = |p: &DVec3| base + bend * p.length_squared();
-    let weights: Vec<f64> = points.iter().map(|p| gaussian(p.length_squared(), h)).collect();
+    let weights: Vec<f64> = points
+        .iter()
+        .map(|p| gaussian(p.length_squared(), h))
+        .collect();
     let score = |normal: DVec3, through: DVec3| -> f64 {
         (points.iter().zip(&weights))
             .map(|(p, w)| {
@@ -41,7 +44,9 @@ pub(crate) fn robust_normal(points: &[DVec3], scale: &Scale) -> Option<(DVec3, f
         let [a, b, c] = draw(&mut dice, n.min(DRAWN_FROM)).map(|i| points[i]);
         let cross = (b - a).cross(c - a);
         let size = cross.length();
-        if !(size > 0.2 * (b - a).length() * (c - a).length()) || size < 0.1 * scale.spacing_mm * scale.spacing_mm {
+        if !(size > 0.2 * (b - a).length() * (c - a).length())
+            || size < 0.1 * scale.spacing_mm * scale.spacing_mm
+        {
             continue;
         }
         let normal = cross / size;
@@ -82,7 +87,9 @@ pub(crate) fn robust_normal(points: &[DVec3], scale: &Scale) -> Option<(DVec3, f
 /// Three different numbers below `n`.
 fn draw(dice: &mut u64, n: usize) -> [usize; 3] {
     let mut next = || {
-        *dice = dice.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        *dice = dice
+            .wrapping_mul(6_364_136_223_846_793_005)
+            .wrapping_add(1_442_695_040_888_963_407);
         ((*dice >> 33) as usize) % n
     };
     let a = next();

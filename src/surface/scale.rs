@@ -77,14 +77,18 @@ fn points_for(ratio: f64) -> usize {
 /// Indices of the points that support the surface, in the order of `neighbors`: no two closer than `distance_mm`.
 pub(crate) fn thin(positions: &[DVec3], neighbors: &Neighbors, distance_mm: f64) -> Vec<u32> {
     let cell = |p: DVec3| (p / distance_mm).floor().as_i64vec3();
-    let mut taken: std::collections::HashMap<glam::I64Vec3, Vec<u32>> = std::collections::HashMap::new();
+    let mut taken: std::collections::HashMap<glam::I64Vec3, Vec<u32>> =
+        std::collections::HashMap::new();
     let mut kept = Vec::new();
     for &index in neighbors.order() {
         let p = positions[index as usize];
         let home = cell(p);
-        let near = (-1..=1).flat_map(|x| (-1..=1).flat_map(move |y| (-1..=1).map(move |z| (x, y, z))));
-        let mut others = near.filter_map(|(x, y, z)| taken.get(&(home + glam::I64Vec3::new(x, y, z))));
-        let close = |i: &u32| positions[*i as usize].distance_squared(p) < distance_mm * distance_mm;
+        let near =
+            (-1..=1).flat_map(|x| (-1..=1).flat_map(move |y| (-1..=1).map(move |z| (x, y, z))));
+        let mut others =
+            near.filter_map(|(x, y, z)| taken.get(&(home + glam::I64Vec3::new(x, y, z))));
+        let close =
+            |i: &u32| positions[*i as usize].distance_squared(p) < distance_mm * distance_mm;
         if others.any(|cell| cell.iter().any(close)) {
             continue;
         }

@@ -1,13 +1,13 @@
 //! A made-up inspection of a part with straight, concave, circular and wavy edges, as realistic as its numbers need to be.
 
-use std::collections::BTreeMap;
 use std::f64::consts::TAU;
 use std::time::{Duration, UNIX_EPOCH};
 
 use acies::geometry::RigidTransform;
+use acies::inspect::recipe::{Limits, Recipe, Rule};
 use acies::inspect::result::{Alignment, EdgeResult, Inspection, Measured, StationResult, Verdict};
 use acies::nominal::{EdgeKind, Station};
-use acies::report::{DeviceFacts, EdgeLimits, Facts, LimitFacts, Rule, ScanFacts};
+use acies::report::{DeviceFacts, Facts, ScanFacts};
 use acies_drivers::device::{Identity, Losses};
 use glam::{DQuat, DVec3};
 
@@ -233,6 +233,7 @@ pub fn inspection(stations: usize) -> Inspection {
         findings: vec![
             "213 points lie more than 2 mm from every face and were not used".to_owned(),
         ],
+        scan: None,
     }
 }
 
@@ -274,14 +275,13 @@ pub fn facts() -> Facts {
                 losses: None,
             },
         ],
-        limits: LimitFacts {
-            rule: Rule::GuardBand { k: 2.0 },
-            all: EdgeLimits {
-                d1_mm: Some([-LIMIT_MM, LIMIT_MM]),
-                d2_mm: Some([-LIMIT_MM, LIMIT_MM]),
-                angle_deviation_rad: Some([-1f64.to_radians(), 1f64.to_radians()]),
+        recipe: Recipe {
+            rule: Rule::GuardBand(2.0),
+            limits: Limits {
+                d_mm: [Some([-LIMIT_MM, LIMIT_MM]); 2],
+                angle_rad: Some([-1f64.to_radians(), 1f64.to_radians()]),
             },
-            by_edge: BTreeMap::new(),
+            ..Recipe::default()
         },
     }
 }
@@ -317,6 +317,6 @@ pub fn spoil(
         17 => inspection.alignment.part_from_machine.translation.x = bad,
         18 => inspection.unexpected_edges[0][1].z = bad,
         19 => facts.scan.noise_mm = Some(bad),
-        _ => facts.limits.all.d1_mm = Some([-bad, bad]),
+        _ => facts.recipe.limits.d_mm[0] = Some([-bad, bad]),
     }
 }

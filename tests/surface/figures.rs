@@ -73,20 +73,24 @@ pub fn cube_trial(n: usize, percent: f64) -> Trial {
 
 /// The stepped block, `count` random points, Gaussian noise of 0.1 spacings in every direction.
 pub fn block_trial(count: usize) -> Trial {
+    body_trial("machined block", stepped_block(), count, 0.1)
+}
+
+/// `count` random points of a body, Gaussian noise of `ratio` spacings in every direction.
+pub fn body_trial(name: &str, body: Body, count: usize, ratio: f64) -> Trial {
     let mut dice = Dice(11);
-    let body = stepped_block();
     let unit_mm = (body.area() / count as f64).sqrt();
     let seen = body
         .points(count, &mut dice)
         .into_iter()
         .map(|(clean, face)| Seen {
-            noisy: clean + dice.cloud() * (0.1 * unit_mm),
+            noisy: clean + dice.cloud() * (ratio * unit_mm),
             clean,
             face,
         })
         .collect();
     Trial {
-        name: format!("machined block, {count}"),
+        name: format!("{name}, {count}"),
         body,
         seen,
         unit_mm,
@@ -98,7 +102,11 @@ pub fn lines_trial(across_mm: f64) -> Trial {
     let mut dice = Dice(13);
     let body = stepped_block();
     let towards = DVec3::new(0.45, -0.35, 0.82);
-    let seen = body.scan(towards, (0.1 * across_mm, across_mm), (0.01 * across_mm, &mut dice));
+    let seen = body.scan(
+        towards,
+        (0.1 * across_mm, across_mm),
+        (0.01 * across_mm, &mut dice),
+    );
     Trial {
         name: format!("block in scan lines 1:10, {}", seen.len()),
         body,
@@ -117,7 +125,11 @@ impl Trial {
 
     pub fn figures(&self, result: &Reconstruction) -> Figures {
         let s = self.unit_mm;
-        let near: Vec<bool> = self.seen.iter().map(|p| self.body.edge_distance(p.clean) < 3.0 * s).collect();
+        let near: Vec<bool> = self
+            .seen
+            .iter()
+            .map(|p| self.body.edge_distance(p.clean) < 3.0 * s)
+            .collect();
         let rms = |at: &dyn Fn(usize) -> DVec3, edge: bool| {
             let d: Vec<f64> = (0..near.len())
                 .filter(|i| near[*i] == edge)
@@ -127,7 +139,9 @@ impl Trial {
         };
         let input = |i: usize| self.seen[i].noisy;
         let output = |i: usize| result.positions[i];
-        let worst = (0..near.len()).map(|i| self.body.distance(output(i)) / s).fold(0.0, f64::max);
+        let worst = (0..near.len())
+            .map(|i| self.body.distance(output(i)) / s)
+            .fold(0.0, f64::max);
         let normals = self.normal_angles(result);
         let mean = |v: &[(f64, f64)], edge: bool, second: bool| {
             let picked: Vec<f64> = (v.iter().zip(&near))
@@ -137,7 +151,11 @@ impl Trial {
                 .collect();
             picked.iter().sum::<f64>() / picked.len().max(1) as f64
         };
-        let lines: Vec<f64> = result.lines.iter().map(|l| self.body.edge_distance(l.position) / s).collect();
+        let lines: Vec<f64> = result
+            .lines
+            .iter()
+            .map(|l| self.body.edge_distance(l.position) / s)
+            .collect();
         Figures {
             input_flat: rms(&input, false),
             input_edge: rms(&input, true),
@@ -145,7 +163,12 @@ impl Trial {
             edge: rms(&output, true),
             edge_gap_own: self.edge_gap(&result.positions),
             edge_gap: self.edge_gap(
-                &result.positions.iter().copied().chain(result.lines.iter().map(|l| l.position)).collect::<Vec<_>>(),
+                &result
+                    .positions
+                    .iter()
+                    .copied()
+                    .chain(result.lines.iter().map(|l| l.position))
+                    .collect::<Vec<_>>(),
             ),
             worst,
             projected: result.projected.iter().filter(|p| **p).count() as f64 / near.len() as f64,
@@ -178,9 +201,14 @@ impl Trial {
                     .map(|f| f.nearest(p))
                     .min_by(|a, b| a.0.distance(p).total_cmp(&b.0.distance(p)))
                     .expect("a body has faces");
-                let measured = self.body.faces[self.seen[i].face].nearest(self.seen[i].clean).1;
+                let measured = self.body.faces[self.seen[i].face]
+                    .nearest(self.seen[i].clean)
+                    .1;
                 let angle = |truth: DVec3| {
-                    let cosine = normals.iter().map(|n| n.dot(truth).abs()).fold(0.0, f64::max);
+                    let cosine = normals
+                        .iter()
+                        .map(|n| n.dot(truth).abs())
+                        .fold(0.0, f64::max);
                     cosine.min(1.0).acos().to_degrees()
                 };
                 (angle(nearest), angle(measured))
@@ -202,7 +230,10 @@ impl Trial {
                 let p = edge.at(k as f64 / steps as f64);
                 input.within(p, 1.5 * s, &mut found);
                 let first = found.first().map(|f| self.seen[f.0 as usize].face);
-                if found.iter().all(|f| Some(self.seen[f.0 as usize].face) == first) {
+                if found
+                    .iter()
+                    .all(|f| Some(self.seen[f.0 as usize].face) == first)
+                {
                     continue;
                 }
                 neighbors.nearest(p, 1, &mut found);

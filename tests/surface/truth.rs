@@ -92,7 +92,11 @@ impl Face {
     /// A point, uniform by area.
     pub fn sample(&self, dice: &mut Dice) -> DVec3 {
         match self {
-            Face::Rectangle { corner, sides, holes } => loop {
+            Face::Rectangle {
+                corner,
+                sides,
+                holes,
+            } => loop {
                 let (a, b) = (dice.unit(), dice.unit());
                 let (x, y) = (a * sides[0].length(), b * sides[1].length());
                 if holes.iter().all(|h| (x - h.0).hypot(y - h.1) >= h.2) {
@@ -110,7 +114,11 @@ impl Face {
     /// Nearest point of the face, and its unit normal there.
     pub fn nearest(&self, p: DVec3) -> (DVec3, DVec3) {
         match self {
-            Face::Rectangle { corner, sides, holes } => {
+            Face::Rectangle {
+                corner,
+                sides,
+                holes,
+            } => {
                 let [a, b] = sides.map(|s| s.length());
                 let (u, v) = (sides[0] / a, sides[1] / b);
                 let d = p - *corner;
@@ -119,7 +127,11 @@ impl Face {
                     let (dx, dy) = (x - h.0, y - h.1);
                     let r = dx.hypot(dy);
                     if r < h.2 {
-                        let (ex, ey) = if r > 0.0 { (dx / r, dy / r) } else { (1.0, 0.0) };
+                        let (ex, ey) = if r > 0.0 {
+                            (dx / r, dy / r)
+                        } else {
+                            (1.0, 0.0)
+                        };
                         (x, y) = (h.0 + ex * h.2, h.1 + ey * h.2);
                     }
                 }
@@ -130,7 +142,10 @@ impl Face {
                 let d = p - *base;
                 let z = d.dot(along);
                 let out = (d - along * z).normalize_or(along.any_orthonormal_vector());
-                (*base + along * z.clamp(0.0, axis.length()) + out * *radius, out)
+                (
+                    *base + along * z.clamp(0.0, axis.length()) + out * *radius,
+                    out,
+                )
             }
         }
     }
@@ -138,7 +153,11 @@ impl Face {
     /// Distance along the unit `ray` from `from` to the face, where it is hit.
     pub fn hit(&self, from: DVec3, ray: DVec3) -> Vec<f64> {
         match self {
-            Face::Rectangle { corner, sides, holes } => {
+            Face::Rectangle {
+                corner,
+                sides,
+                holes,
+            } => {
                 let [a, b] = sides.map(|s| s.length());
                 let (u, v) = (sides[0] / a, sides[1] / b);
                 let n = u.cross(v);
@@ -159,14 +178,20 @@ impl Face {
                 let along = axis.normalize();
                 let across = |d: DVec3| d - along * d.dot(along);
                 let (f, r) = (across(from - *base), across(ray));
-                let (a, b, c) = (r.length_squared(), f.dot(r), f.length_squared() - radius * radius);
+                let (a, b, c) = (
+                    r.length_squared(),
+                    f.dot(r),
+                    f.length_squared() - radius * radius,
+                );
                 let root = b * b - a * c;
                 if root <= 0.0 || a <= 0.0 {
                     return Vec::new();
                 }
                 [(-b - root.sqrt()) / a, (-b + root.sqrt()) / a]
                     .into_iter()
-                    .filter(|t| (0.0..=axis.length()).contains(&(from + ray * *t - *base).dot(along)))
+                    .filter(|t| {
+                        (0.0..=axis.length()).contains(&(from + ray * *t - *base).dot(along))
+                    })
                     .collect()
             }
         }
@@ -224,7 +249,10 @@ impl Body {
 
     /// Distance to the nearest sharp edge.
     pub fn edge_distance(&self, p: DVec3) -> f64 {
-        self.edges.iter().map(|e| e.distance(p)).fold(f64::INFINITY, f64::min)
+        self.edges
+            .iter()
+            .map(|e| e.distance(p))
+            .fold(f64::INFINITY, f64::min)
     }
 
     /// `count` points, uniform by area, and the face each lies on.
@@ -239,14 +267,22 @@ impl Body {
         (0..count)
             .map(|_| {
                 let t = dice.unit();
-                let face = ends.iter().position(|e| t < *e).unwrap_or(self.faces.len() - 1);
+                let face = ends
+                    .iter()
+                    .position(|e| t < *e)
+                    .unwrap_or(self.faces.len() - 1);
                 (self.faces[face].sample(dice), face)
             })
             .collect()
     }
 
     /// What parallel rays see of the body: lines `across` apart, points `along` apart on a line, noise of `sigma` along the rays.
-    pub fn scan(&self, towards: DVec3, (along, across): (f64, f64), (sigma, dice): (f64, &mut Dice)) -> Vec<Seen> {
+    pub fn scan(
+        &self,
+        towards: DVec3,
+        (along, across): (f64, f64),
+        (sigma, dice): (f64, &mut Dice),
+    ) -> Vec<Seen> {
         let ray = -towards.normalize();
         let u = ray.cross(DVec3::new(0.3, 1.0, 0.2)).normalize();
         let v = ray.cross(u);
@@ -256,7 +292,8 @@ impl Body {
         let columns = (80.0 / along) as i64;
         for line in -lines..=lines {
             for column in -columns..=columns {
-                let from = centre + v * (line as f64 * across) + u * (column as f64 * along) - ray * 200.0;
+                let from =
+                    centre + v * (line as f64 * across) + u * (column as f64 * along) - ray * 200.0;
                 let mut first = (f64::INFINITY, 0);
                 for (index, face) in self.faces.iter().enumerate() {
                     for t in face.hit(from, ray) {
@@ -339,7 +376,9 @@ pub fn cube_with_hole_points(n: usize) -> Vec<(DVec3, usize)> {
             Face::Rectangle { corner, sides, .. } => {
                 for i in 0..=n {
                     for j in 0..=n {
-                        let p = *corner + sides[0] * (i as f64 / n as f64) + sides[1] * (j as f64 / n as f64);
+                        let p = *corner
+                            + sides[0] * (i as f64 / n as f64)
+                            + sides[1] * (j as f64 / n as f64);
                         if index > 1 || edge_free(p) {
                             points.push((p, index));
                         }
@@ -351,7 +390,10 @@ pub fn cube_with_hole_points(n: usize) -> Vec<(DVec3, usize)> {
                 for i in 0..=n {
                     for j in 0..around {
                         let (s, c) = (std::f64::consts::TAU * j as f64 / around as f64).sin_cos();
-                        points.push((*base + *axis * (i as f64 / n as f64) + DVec3::new(c, s, 0.0) * *radius, index));
+                        points.push((
+                            *base + *axis * (i as f64 / n as f64) + DVec3::new(c, s, 0.0) * *radius,
+                            index,
+                        ));
                     }
                 }
             }
@@ -374,12 +416,37 @@ pub fn stepped_block() -> Body {
         ]
     };
     let mut faces = vec![
-        Face::rectangle(v(0.0, 0.0, 0.0), v(100.0, 0.0, 0.0), v(0.0, 60.0, 0.0), &[a, b]),
-        Face::rectangle(v(0.0, 0.0, 30.0), v(60.0, 0.0, 0.0), v(0.0, 60.0, 0.0), &[a]),
-        Face::rectangle(v(60.0, 0.0, 15.0), v(40.0, 0.0, 0.0), v(0.0, 60.0, 0.0), &[(20.0, 30.0, 6.0)]),
+        Face::rectangle(
+            v(0.0, 0.0, 0.0),
+            v(100.0, 0.0, 0.0),
+            v(0.0, 60.0, 0.0),
+            &[a, b],
+        ),
+        Face::rectangle(
+            v(0.0, 0.0, 30.0),
+            v(60.0, 0.0, 0.0),
+            v(0.0, 60.0, 0.0),
+            &[a],
+        ),
+        Face::rectangle(
+            v(60.0, 0.0, 15.0),
+            v(40.0, 0.0, 0.0),
+            v(0.0, 60.0, 0.0),
+            &[(20.0, 30.0, 6.0)],
+        ),
         Face::rectangle(v(0.0, 0.0, 0.0), v(0.0, 60.0, 0.0), v(0.0, 0.0, 30.0), &[]),
-        Face::rectangle(v(60.0, 0.0, 15.0), v(0.0, 60.0, 0.0), v(0.0, 0.0, 15.0), &[]),
-        Face::rectangle(v(100.0, 0.0, 0.0), v(0.0, 60.0, 0.0), v(0.0, 0.0, 15.0), &[]),
+        Face::rectangle(
+            v(60.0, 0.0, 15.0),
+            v(0.0, 60.0, 0.0),
+            v(0.0, 0.0, 15.0),
+            &[],
+        ),
+        Face::rectangle(
+            v(100.0, 0.0, 0.0),
+            v(0.0, 60.0, 0.0),
+            v(0.0, 0.0, 15.0),
+            &[],
+        ),
     ];
     faces.extend(side(0.0));
     faces.extend(side(60.0));
@@ -391,7 +458,14 @@ pub fn stepped_block() -> Body {
     faces.push(hole(30.0, 30.0, 10.0));
     faces.push(hole(80.0, 15.0, 6.0));
 
-    let profile = [(0.0, 0.0), (100.0, 0.0), (100.0, 15.0), (60.0, 15.0), (60.0, 30.0), (0.0, 30.0)];
+    let profile = [
+        (0.0, 0.0),
+        (100.0, 0.0),
+        (100.0, 15.0),
+        (60.0, 15.0),
+        (60.0, 30.0),
+        (0.0, 30.0),
+    ];
     let mut edges = Vec::new();
     for (i, p) in profile.iter().enumerate() {
         let q = profile[(i + 1) % profile.len()];
@@ -405,4 +479,49 @@ pub fn stepped_block() -> Body {
         edges.push(Edge::Circle(v(x, 30.0, depth), DVec3::Z, radius));
     }
     Body { faces, edges }
+}
+
+/// Two square plates of side 20 that meet along the y axis at an included angle.
+pub fn ridge(included_deg: f64) -> Body {
+    let half = (included_deg / 2.0).to_radians();
+    let y = DVec3::Y * 20.0;
+    let down = |sign: f64| DVec3::new(sign * half.sin(), 0.0, -half.cos()) * 20.0;
+    Body {
+        faces: vec![
+            Face::rectangle(DVec3::ZERO, y, down(1.0), &[]),
+            Face::rectangle(DVec3::ZERO, y, down(-1.0), &[]),
+        ],
+        edges: vec![Edge::Segment(DVec3::ZERO, y)],
+    }
+}
+
+/// Two parallel square plates of side 20, `gap` apart; no edge.
+pub fn plates(gap: f64) -> Body {
+    let (x, y) = (DVec3::X * 20.0, DVec3::Y * 20.0);
+    Body {
+        faces: vec![
+            Face::rectangle(DVec3::ZERO, x, y, &[]),
+            Face::rectangle(DVec3::Z * gap, x, y, &[]),
+        ],
+        edges: vec![Edge::Segment(DVec3::splat(1e6), DVec3::splat(1e6 + 1.0))],
+    }
+}
+
+/// A slot of the given width and depth in a plate of side 20, closed at its ends by nothing.
+pub fn slot(width: f64, depth: f64) -> Body {
+    let y = DVec3::Y * 20.0;
+    let v = |x: f64, z: f64| DVec3::new(x, 0.0, z);
+    let w = 0.5 * width;
+    Body {
+        faces: vec![
+            Face::rectangle(v(-10.0, 0.0), DVec3::X * (10.0 - w), y, &[]),
+            Face::rectangle(v(w, 0.0), DVec3::X * (10.0 - w), y, &[]),
+            Face::rectangle(v(-w, -depth), DVec3::X * width, y, &[]),
+            Face::rectangle(v(-w, -depth), DVec3::Z * depth, y, &[]),
+            Face::rectangle(v(w, -depth), DVec3::Z * depth, y, &[]),
+        ],
+        edges: [(-w, 0.0), (w, 0.0), (-w, -depth), (w, -depth)]
+            .map(|(x, z)| Edge::Segment(v(x, z), v(x, z) + y))
+            .into(),
+    }
 }

@@ -2,7 +2,7 @@
 
 use glam::DVec3;
 
-use super::span::Window;
+use super::span::{Ray, Window};
 use crate::pose::Pose;
 
 /// A box along the axes of its frame; unbounded sides are infinite.
@@ -78,24 +78,12 @@ impl Bounds {
     }
 
     /// The part of the window in which the ray is in the box.
-    pub(super) fn clip(&self, origin: DVec3, direction: DVec3, window: Window) -> Option<Window> {
-        let Window { mut from, mut to } = window;
-        for axis in 0..3 {
-            let (o, d) = (origin[axis], direction[axis]);
-            if d == 0.0 {
-                if o < self.low[axis] || o > self.high[axis] {
-                    return None;
-                }
-                continue;
-            }
-            let inverse = 1.0 / d;
-            let (a, b) = (
-                (self.low[axis] - o) * inverse,
-                (self.high[axis] - o) * inverse,
-            );
-            from = from.max(a.min(b));
-            to = to.min(a.max(b));
-        }
+    pub(super) fn clip(&self, ray: &Ray, window: Window) -> Option<Window> {
+        // where a component is zero this is infinite, or NaN on the very side of the box: boxes are wider than what they hold
+        let a = (self.low - ray.origin) * ray.inverse;
+        let b = (self.high - ray.origin) * ray.inverse;
+        let from = window.from.max(a.min(b).max_element());
+        let to = window.to.min(a.max(b).min_element());
         (from < to).then_some(Window { from, to })
     }
 }

@@ -4,7 +4,7 @@ use glam::DVec3;
 use smallvec::SmallVec;
 
 use super::bounds::Bounds;
-use super::span::{Crossing, Span, Spans, Window};
+use super::span::{Crossing, Ray, Span, Spans, Window};
 use super::surface::SurfaceId;
 
 /// Why a mesh is no body.
@@ -89,8 +89,8 @@ impl Facets {
     }
 
     /// Spans of the ray inside the mesh.
-    pub(super) fn spans(&self, id: SurfaceId, (o, d): (DVec3, DVec3), window: Window) -> Spans {
-        let mut crossings = self.crossings(o, d);
+    pub(super) fn spans(&self, id: SurfaceId, ray: &Ray, window: Window) -> Spans {
+        let mut crossings = self.crossings(ray);
         crossings.sort_by(|a, b| a.t.total_cmp(&b.t));
         let mut spans = Spans::new();
         let mut depth = 0;
@@ -119,20 +119,20 @@ impl Facets {
     }
 
     /// Every crossing of the whole line; one that passes an edge or a vertex belongs to exactly one facet each way.
-    fn crossings(&self, o: DVec3, d: DVec3) -> SmallVec<[FacetCrossing; 8]> {
+    fn crossings(&self, ray: &Ray) -> SmallVec<[FacetCrossing; 8]> {
         let mut found = SmallVec::new();
         let line = Window {
             from: f64::NEG_INFINITY,
             to: f64::INFINITY,
         };
-        let frame = Shear::new(d);
+        let frame = Shear::new(ray.direction);
         let mut stack: SmallVec<[u32; 64]> = SmallVec::new();
         if !self.nodes.is_empty() {
             stack.push(0);
         }
         while let Some(index) = stack.pop() {
             let node = &self.nodes[index as usize];
-            if node.bounds.clip(o, d, line).is_none() {
+            if node.bounds.clip(ray, line).is_none() {
                 continue;
             }
             if node.to == 0 {
@@ -141,7 +141,7 @@ impl Facets {
                 continue;
             }
             for slot in node.from..node.to {
-                let [a, b, c] = self.corners[slot as usize].map(|p| frame.apply(p - o));
+                let [a, b, c] = self.corners[slot as usize].map(|p| frame.apply(p - ray.origin));
                 if let Some((t, entering)) = pierce(a, b, c) {
                     found.push(FacetCrossing {
                         t,

@@ -328,26 +328,13 @@ impl Solid {
 
     /// The parts of the ray inside the solid.
     pub(super) fn spans(&self, surfaces: &Surfaces, ray: &Ray, window: Window) -> Spans {
-        let Some(window) = self.bounds.clip(ray.origin, ray.direction, window) else {
+        let Some(window) = self.bounds.clip(ray, window) else {
             return Spans::new();
         };
         match &self.node {
             Node::Region(id) => surfaces.get(*id).spans(*id, ray, window),
             Node::Prism(prism) => prism.spans(ray, window),
-            Node::All(solids) => {
-                let mut spans = window.whole();
-                for solid in solids {
-                    let (Some(first), Some(last)) = (spans.first(), spans.last()) else {
-                        break;
-                    };
-                    let hull = Window {
-                        from: first.enter.t,
-                        to: last.leave.t,
-                    };
-                    spans = both(&spans, &solid.spans(surfaces, ray, hull));
-                }
-                spans
-            }
+            Node::All(solids) => common_spans(solids, surfaces, ray, window),
             Node::Any(solids) => solids.iter().fold(Spans::new(), |spans, solid| {
                 either(&spans, &solid.spans(surfaces, ray, window))
             }),
@@ -398,6 +385,41 @@ impl Solid {
             Node::Not(solid) => solid.place(pose),
         }
     }
+}
+
+/// Spans inside all of them. The planes among them, and mostly all are, only move the two ends of one span.
+fn common_spans(solids: &[Solid], surfaces: &Surfaces, ray: &Ray, window: Window) -> Spans {
+    let mut one = Span {
+        enter: Crossing::OPEN_START.moved(window.from),
+        leave: Crossing::OPEN_END.moved(window.to),
+    };
+    let mut others = smallvec::SmallVec::<[&Solid; 8]>::new();
+    for solid in solids {
+        match &solid.node {
+            Node::Region(id) => match &surfaces.get(*id).shape {
+                Shape::Plane { normal, offset } => {
+                    if !one.cut((*normal, *offset), *id, ray) {
+                        return Spans::new();
+                    }
+                }
+                _ => others.push(solid),
+            },
+            _ => others.push(solid),
+        }
+    }
+    let mut spans = Spans::new();
+    spans.push(one);
+    for solid in others {
+        let (Some(first), Some(last)) = (spans.first(), spans.last()) else {
+            break;
+        };
+        let hull = Window {
+            from: first.enter.t,
+            to: last.leave.t,
+        };
+        spans = both(&spans, &solid.spans(surfaces, ray, hull));
+    }
+    spans
 }
 
 impl Prism {

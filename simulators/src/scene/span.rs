@@ -12,14 +12,22 @@ pub struct Ray {
     pub origin: DVec3,
     /// Unit vector.
     pub direction: DVec3,
+    /// One over each component, for boxes; infinite where a component is zero.
+    pub(crate) inverse: DVec3,
 }
 
 impl Ray {
     /// From `origin` towards `direction`, of any length but zero.
     pub fn new(origin: DVec3, direction: DVec3) -> Ray {
+        Ray::along(origin, direction.normalize())
+    }
+
+    /// From `origin` along the unit vector `direction`.
+    pub fn along(origin: DVec3, direction: DVec3) -> Ray {
         Ray {
             origin,
-            direction: direction.normalize(),
+            direction,
+            inverse: 1.0 / direction,
         }
     }
 
@@ -68,6 +76,24 @@ impl Crossing {
 pub(crate) struct Span {
     pub enter: Crossing,
     pub leave: Crossing,
+}
+
+impl Span {
+    /// Keeps what lies below a plane; false when nothing is left.
+    pub fn cut(&mut self, (normal, offset): (DVec3, f64), id: SurfaceId, ray: &Ray) -> bool {
+        let speed = normal.dot(ray.direction);
+        let height = normal.dot(ray.origin) - offset;
+        if speed == 0.0 {
+            return height <= 0.0;
+        }
+        let t = -height / speed;
+        if speed < 0.0 && t >= self.enter.t {
+            self.enter = Crossing::at(t, id);
+        } else if speed > 0.0 && t <= self.leave.t {
+            self.leave = Crossing::at(t, id);
+        }
+        self.enter.t < self.leave.t
+    }
 }
 
 /// Ascending and disjoint.

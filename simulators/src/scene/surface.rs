@@ -74,11 +74,16 @@ pub struct HeightField {
 impl HeightField {
     /// Height at (x, y), mm; beyond the rectangle the same polynomial goes on.
     pub fn height(&self, x: f64, y: f64) -> f64 {
-        let a = cubic((x - self.x[0]) / (self.x[1] - self.x[0]));
-        let b = cubic((y - self.y[0]) / (self.y[1] - self.y[0]));
-        (0..4)
-            .map(|i| a[i] * (0..4).map(|j| b[j] * self.z[i][j]).sum::<f64>())
-            .sum()
+        self.blend(
+            cubic((x - self.x[0]) / (self.x[1] - self.x[0])),
+            cubic((y - self.y[0]) / (self.y[1] - self.y[0])),
+        )
+    }
+
+    fn blend(&self, a: [f64; 4], b: [f64; 4]) -> f64 {
+        let row = |z: &[f64; 4]| b[0] * z[0] + b[1] * z[1] + b[2] * z[2] + b[3] * z[3];
+        let [p, q, r, s] = &self.z;
+        a[0] * row(p) + a[1] * row(q) + a[2] * row(r) + a[3] * row(s)
     }
 
     /// Derivatives of the height by x and by y.
@@ -87,12 +92,7 @@ impl HeightField {
         let (u, v) = ((x - self.x[0]) / w, (y - self.y[0]) / h);
         let (a, b) = (cubic(u), cubic(v));
         let (da, db) = (cubic_slope(u), cubic_slope(v));
-        let sum = |a: [f64; 4], b: [f64; 4]| -> f64 {
-            (0..4)
-                .map(|i| a[i] * (0..4).map(|j| b[j] * self.z[i][j]).sum::<f64>())
-                .sum()
-        };
-        [sum(da, b) / w, sum(a, db) / h]
+        [self.blend(da, b) / w, self.blend(a, db) / h]
     }
 
     /// Least and greatest control height: the surface over the rectangle lies between them.
@@ -277,7 +277,10 @@ impl Surface {
             Shape::HeightField { pose, field } => {
                 field_spans(id, local_ray(pose, ray), field, window)
             }
-            Shape::Facets { pose, facets } => facets.spans(id, local_ray(pose, ray), window),
+            Shape::Facets { pose, facets } => {
+                let (o, d) = local_ray(pose, ray);
+                facets.spans(id, &Ray::along(o, d), window)
+            }
         }
     }
 }
@@ -292,22 +295,9 @@ fn local_ray(pose: &Pose, ray: &Ray) -> (DVec3, DVec3) {
 }
 
 fn plane_spans(id: SurfaceId, plane: (DVec3, f64), ray: &Ray, window: Window) -> Spans {
-    let (normal, offset) = plane;
-    let speed = normal.dot(ray.direction);
-    let height = normal.dot(ray.origin) - offset;
-    if speed == 0.0 {
-        return if height <= 0.0 {
-            window.whole()
-        } else {
-            Spans::new()
-        };
-    }
-    let crossing = Crossing::at(-height / speed, id);
-    if speed < 0.0 {
-        window.keep(crossing, Crossing::OPEN_END)
-    } else {
-        window.keep(Crossing::OPEN_START, crossing)
-    }
+    let mut spans = window.whole();
+    spans.retain(|span| span.cut(plane, id, ray));
+    spans
 }
 
 /// Spans of a convex region a t^2 + 2 b t + c <= 0 with a >= 0.
@@ -352,8 +342,11 @@ fn cone_spans(id: SurfaceId, (o, d): (DVec3, DVec3), half_angle: f64, window: Wi
             (true, false) => window.keep(Crossing::OPEN_START, crossing),
         };
     }
-    let Some([t1, t2]) = quadratic(a, b, c) else {
-        return Spans::new();
+    let [t1, t2] = match quadratic(a, b, c) {
+        Some(roots) => roots,
+        // a steep ray always meets both nappes, if only in the apex
+        None if a < 0.0 => [-b / a; 2],
+        None => return Spans::new(),
     };
     let (first, second) = (Crossing::at(t1, id), Crossing::at(t2, id));
     if a > 0.0 {
@@ -451,10 +444,13 @@ fn field_spans(
         spans.extend(window.keep(Crossing::OPEN_START, Crossing::OPEN_END.moved(near)));
     }
     if let Some(inner) = window.narrowed(near, far) {
-        let height = |t: f64| {
-            let p = o + t * d;
-            p.z - field.height(p.x, p.y)
-        };
+        let (w, h) = (
+            1.0 / (field.x[1] - field.x[0]),
+            1.0 / (field.y[1] - field.y[0]),
+        );
+        let (u, du) = ((o.x - field.x[0]) * w, d.x * w);
+        let (v, dv) = ((o.y - field.y[0]) * h, d.y * h);
+        let height = |t: f64| o.z + t * d.z - field.blend(cubic(u + t * du), cubic(v + t * dv));
         for span in inside_between::<7>(id, height, inner) {
             super::span::append(&mut spans, span);
         }

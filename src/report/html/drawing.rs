@@ -8,7 +8,7 @@ use serde_json::{Value, json};
 use super::page::{Escaped, class};
 use super::plot::nice_step;
 use crate::report::figure::Figure;
-use crate::report::wire::{Edge, Quantity, Report, Station, Xyz};
+use crate::report::wire::{Edge, Quantity, Report, Station, Status, Xyz};
 
 const WIDTH: f64 = 720.0;
 const HEIGHT: f64 = 480.0;
@@ -108,10 +108,12 @@ impl<'a> Drawing<'a> {
             let p = at(line.points[line.points.len() / 2]);
             writeln!(
                 out,
-                r#"<text text-anchor="middle" x="{:.1}" y="{:.1}">{}</text>"#,
+                r#"<text class="f-{}" text-anchor="middle" x="{:.1}" y="{:.1}">{}{}</text>"#,
+                class(line.edge.verdict),
                 p.x,
                 p.y - 7.0,
-                Escaped(&line.edge.id)
+                Escaped(&line.edge.id),
+                sign(line.edge.verdict)
             )?;
         }
         write_axes(out)?;
@@ -166,6 +168,8 @@ impl<'a> Drawing<'a> {
             .map(|line| {
                 json!({
                     "id": line.edge.id,
+                    "name": format!("{}{}", line.edge.id, sign(line.edge.verdict)),
+                    "verdict": class(line.edge.verdict),
                     "first": line.first,
                     "xyz": line.points.iter().map(|p| text(*p, 1e-3)).collect::<Vec<_>>(),
                     "off": line.stations.iter().map(|s| offset(s).map(|v| text(v, 1e-4))).collect::<Vec<_>>(),
@@ -229,6 +233,15 @@ fn state(station: &Station) -> &'static str {
     match station.measured {
         None => "gap",
         Some(_) => class(station.status),
+    }
+}
+
+/// What stands behind the id of an edge that is not OK, so that colour is not alone.
+fn sign(verdict: Status) -> &'static str {
+    match verdict {
+        Status::NotOk => " ×",
+        Status::NotDecidable => " ?",
+        Status::Ok | Status::Undefined => "",
     }
 }
 

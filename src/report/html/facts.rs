@@ -3,6 +3,7 @@
 use std::fmt::{self, Write};
 
 use super::page::{Escaped, State};
+use super::percent;
 use crate::report::figure::{COVERAGE_FACTOR, Figure};
 use crate::report::wire::{Alignment, Losses, Quantity, Recipe, Report, Rule};
 
@@ -105,6 +106,15 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
         ),
     };
     row(out, "rule", &rule)?;
+    if let Some(share) = recipe.minimum_coverage {
+        let text = format!("{} of an edge, or it is not decidable", percent(share));
+        row(out, "must be measured", &text)?;
+    }
+    row(
+        out,
+        "u of d from the calibration",
+        &um(recipe.u_calibration_mm),
+    )?;
     out.write_str("</table>\n")
 }
 

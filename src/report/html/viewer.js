@@ -108,8 +108,9 @@
     pen.setLineDash([]);
     pen.font = '700 14px system-ui, sans-serif'; pen.textAlign = 'center';
     labels.forEach(([edge, p]) => {
-      pen.strokeStyle = card; pen.lineWidth = 4; pen.strokeText(edge.id, p[0], p[1] - 8);
-      pen.fillStyle = ink; pen.fillText(edge.id, p[0], p[1] - 8);
+      pen.strokeStyle = card; pen.lineWidth = 4; pen.strokeText(edge.name, p[0], p[1] - 8);
+      pen.fillStyle = colour(edge.verdict === 'undefined' ? 'line' : edge.verdict);
+      pen.fillText(edge.name, p[0], p[1] - 8);
     });
     pen.textAlign = 'start';
     drawAxes(colour('soft'));
