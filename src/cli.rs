@@ -3,8 +3,8 @@
 mod check;
 mod demo;
 mod devices;
-mod inspect;
 mod progress;
+mod reconstruct;
 
 use std::process::ExitCode;
 
@@ -21,10 +21,10 @@ pub enum Command {
     Demo(demo::Demo),
     /// Say everything that is wrong with a cell's configuration, touching no device.
     Check(check::Check),
-    /// Measure every sharp edge of a scan against its CAD model.
-    Inspect(inspect::Inspect),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
+    /// Take the points of a scan onto the surface they were measured from.
+    Reconstruct(reconstruct::Reconstruct),
 }
 
 impl Command {
@@ -37,7 +37,7 @@ impl Command {
             Command::Demo(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
-            Command::Inspect(command) => command.run(),
+            Command::Reconstruct(command) => command.run(),
         }
     }
 }
