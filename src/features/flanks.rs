@@ -119,7 +119,13 @@ impl Workshop {
             self.seeds.push(Plane::through(
                 self.near[..k].iter().map(|(_, i)| points[*i as usize]),
             ));
-            at = (0..n).fold(0, |best, i| if self.costs[i] > self.costs[best] { i } else { best });
+            at = (0..n).fold(0, |best, i| {
+                if self.costs[i] > self.costs[best] {
+                    i
+                } else {
+                    best
+                }
+            });
         }
     }
 
@@ -129,8 +135,11 @@ impl Workshop {
         let cap = 9.0 * variance;
         self.costs.clear();
         for seed in &self.seeds {
-            self.costs
-                .extend(self.points.iter().map(|p| seed.distance(*p).powi(2).min(cap)));
+            self.costs.extend(
+                self.points
+                    .iter()
+                    .map(|p| seed.distance(*p).powi(2).min(cap)),
+            );
         }
         let row = |s: usize| &self.costs[s * n..(s + 1) * n];
         let single = (0..self.seeds.len())
@@ -158,7 +167,11 @@ impl Workshop {
             .collect();
         while chosen.len() < MOST_PLANES {
             let gain = |s: usize| -> f64 {
-                row(s).iter().zip(&so_far).map(|(a, b)| (b - a).max(0.0)).sum()
+                row(s)
+                    .iter()
+                    .zip(&so_far)
+                    .map(|(a, b)| (b - a).max(0.0))
+                    .sum()
             };
             let (s, g) = (0..self.seeds.len())
                 .map(|s| (s, gain(s)))
@@ -205,7 +218,8 @@ impl Workshop {
         let mut fits: Vec<(u8, Fit)> = (0..count)
             .filter_map(|s| {
                 let members = self.labels.iter().filter(|l| **l == s).count();
-                (members >= 4).then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
+                (members >= 4)
+                    .then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
                     .map(|f| (s, f))
             })
             .collect();
@@ -224,7 +238,9 @@ impl Workshop {
                     }
                 }
             }
-            let Some((change, i, j, union)) = best else { break };
+            let Some((change, i, j, union)) = best else {
+                break;
+            };
             if change > SLIGHT {
                 break;
             }
@@ -291,7 +307,11 @@ impl Workshop {
         }
         match best {
             Some((_, mut crease)) => {
-                crease.corner = if fits.len() > 2 { self.corner(fits) } else { None };
+                crease.corner = if fits.len() > 2 {
+                    self.corner(fits)
+                } else {
+                    None
+                };
                 Verdict::Creased(crease)
             }
             None if unsure => Verdict::Unsure,
@@ -326,7 +346,8 @@ impl Workshop {
             slope += if bent { 192.0 } else { 12.0 } / (n * length2);
         }
         let turn_sd = (variance * slope).sqrt();
-        let believable = turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        let believable =
+            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
         let crease = Crease {
             foot: e,
             tangent,
@@ -365,7 +386,9 @@ impl Workshop {
         const NEAR: f64 = 2.1;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
-                .filter(|i| self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR)
+                .filter(|i| {
+                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
+                })
                 .count();
             near >= 2
         })
