@@ -3,7 +3,11 @@
 mod check;
 mod demo;
 mod devices;
+mod inspect;
+mod nominal;
 mod progress;
+mod reconstruct;
+mod simulate;
 
 use std::process::ExitCode;
 
@@ -18,10 +22,18 @@ use crate::web;
 pub enum Command {
     /// Play a simulated cell: scan a part with known defects, measure its edges, report.
     Demo(demo::Demo),
+    /// Measure every sharp edge of a scan against its nominal.
+    Inspect(inspect::Inspect),
+    /// Project a scan onto its surface, keeping edges sharp.
+    Reconstruct(reconstruct::Reconstruct),
+    /// Say what a CAD file holds: faces, edges, sharp edges, and what was refused.
+    Nominal(nominal::Nominals),
     /// Say everything that is wrong with a cell's configuration, touching no device.
     Check(check::Check),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
+    /// Play one simulated device on a pseudo-terminal or a socket.
+    Simulate(simulate::Simulate),
 }
 
 impl Command {
@@ -32,8 +44,12 @@ impl Command {
     pub fn run(self) -> Result<Status, Failure> {
         match self {
             Command::Demo(command) => command.run(),
+            Command::Inspect(command) => command.run(),
+            Command::Reconstruct(command) => command.run(),
+            Command::Nominal(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
+            Command::Simulate(command) => command.run(),
         }
     }
 }
@@ -130,13 +146,26 @@ pub(crate) fn serve_until_interrupted(address: &str, content: web::Content) -> R
         let (publisher, pages) = web::pages();
         publisher.publish(content);
         eprintln!("page: http://{local}/  (stop with Ctrl-C)");
-        let stop = async {
-            // Where signals cannot be watched the program still ends by them, only less gently.
-            let _ = tokio::signal::ctrl_c().await;
-        };
-        web::serve(listener, pages, stop)
+        web::serve(listener, pages, interrupted())
             .await
             .context("the page")
             .map_err(Failure::Io)
     })
+}
+
+/// Ends when the program is interrupted (Ctrl-C) or told to end (SIGTERM), so that ports and pages are given back.
+pub(crate) async fn interrupted() {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = terminate.recv() => {}
+            }
+            return;
+        }
+    }
+    // Where signals cannot be watched the program still ends by them, only less gently.
+    let _ = tokio::signal::ctrl_c().await;
 }

@@ -71,6 +71,19 @@ impl Move {
     }
 }
 
+impl Move {
+    /// Whether the ball touches where it starts, before or behind it.
+    pub fn touches_at_start(&self, scene: &Scene) -> bool {
+        let back = Move {
+            to: 2.0 * self.from - self.to,
+            ..*self
+        };
+        [*self, back]
+            .iter()
+            .any(|way| way.first_contact(scene).is_some_and(|c| c.travel <= 0.0))
+    }
+}
+
 type Best = Option<(f64, Hit, [f64; 2])>;
 
 struct Bundle<'a> {
@@ -219,6 +232,15 @@ mod tests {
     fn passing_by_is_no_contact_and_starting_in_contact_is_told() {
         assert_eq!(travel([11.51, 9.0, 12.0], [11.51, 9.0, 0.0]), None);
         assert_eq!(travel([4.0, 9.0, 12.0], [4.0, 9.0, 6.6]), None);
-        assert!(travel([4.0, 9.0, 6.4], [4.0, 9.0, 0.0]).unwrap() <= 0.0);
+        let touches = |z: f64, to: f64| {
+            let ball = Move {
+                from: DVec3::new(4.0, 9.0, z),
+                to: DVec3::new(4.0, 9.0, to),
+                radius: 1.5,
+            };
+            ball.touches_at_start(&block())
+        };
+        assert!(touches(6.4, 0.0) && touches(6.4, 9.0));
+        assert!(!touches(6.6, 0.0) && !touches(6.6, 9.0));
     }
 }

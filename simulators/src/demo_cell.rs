@@ -24,7 +24,7 @@ pub const AXIS: DVec3 = DVec3::Y;
 pub const MM_PER_COUNT: f64 = 0.002;
 /// Counts from profile to profile: 0.4 mm.
 pub const STEP_COUNTS: i64 = 200;
-/// Columns of a profile: 0.092 mm apart in the middle of the range.
+/// Columns of a profile: 0.096 mm apart in the middle of the range.
 pub const COLUMNS: u32 = 1000;
 /// Radius of the probe's tip, mm.
 pub const TIP_RADIUS_MM: f64 = 1.0;
@@ -249,7 +249,7 @@ fn optics(camera_side: f64) -> Optics {
     Optics {
         near_mm,
         far_mm,
-        width_mm: 92.0,
+        width_mm: 96.0,
         fan: Fan::Diverging(-50.0),
         camera_mm: Optics::camera_at_angle(near_mm, far_mm, camera_side * 25_f64.to_radians()),
         spot_mm: 0.06,
@@ -321,3 +321,6 @@ fn touches(machine_from_fixture: &Pose) -> Vec<NominalTouch> {
     })
     .to_vec()
 }
+
+#[cfg(test)]
+mod tests;

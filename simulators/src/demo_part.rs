@@ -393,3 +393,6 @@ fn edges(f: &Faces) -> Vec<NominalEdge> {
         ),
     ]
 }
+
+#[cfg(test)]
+mod tests;

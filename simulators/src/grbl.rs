@@ -4,6 +4,8 @@
 
 mod controller;
 mod gcode;
+#[cfg(test)]
+mod tests;
 
 use std::io;
 use std::sync::{Arc, Mutex};

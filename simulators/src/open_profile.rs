@@ -8,6 +8,8 @@ mod device;
 mod feed;
 mod frame;
 mod message;
+#[cfg(test)]
+mod tests;
 
 use std::io;
 use std::sync::{Arc, Condvar, Mutex};

@@ -13,6 +13,9 @@ use rustix::fs::{Mode, OFlags};
 use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
 
+/// A line on which nothing arrives for so long is taken to be empty.
+const QUIET: Duration = Duration::from_millis(20);
+
 /// The device's end of a serial port that appears under a path of one's choice.
 ///
 /// The slave stays open here as well: the line is raw before anyone opens it, and the master sees no hang-up while the port is
@@ -96,22 +99,26 @@ impl PtyDevice {
         read
     }
 
-    /// Waits until everything sent was read. Only a part of what is under way is visible, so it must stay at nothing.
+    /// Waits until everything sent was read. Only what the kernel has moved on to the other end is visible, so it must stay at
+    /// nothing for longer than a busy kernel takes to move more.
     fn drained(&self, patience: Duration) -> bool {
         let Some(ends) = &self.ends else { return true };
         let until = Instant::now() + patience;
-        let mut quiet = 0;
-        while quiet < 3 {
+        let mut empty_since: Option<Instant> = None;
+        loop {
+            let now = Instant::now();
             match rustix::io::ioctl_fionread(&ends.slave) {
-                Ok(0) => quiet += 1,
-                _ => quiet = 0,
+                Ok(0) if empty_since.is_some_and(|since| now - since > QUIET) => return true,
+                Ok(0) => {
+                    empty_since.get_or_insert(now);
+                }
+                _ => empty_since = None,
             }
-            if Instant::now() > until {
+            if now > until {
                 return false;
             }
-            std::thread::sleep(Duration::from_micros(200));
+            std::thread::sleep(Duration::from_micros(500));
         }
-        true
     }
 
     /// Lets the port be opened again after a holder died without closing it: the kernel keeps the exclusive mark of a
@@ -178,3 +185,6 @@ pub(crate) fn wait(line: Option<BorrowedFd<'_>>, write: bool, waker: &OwnedFd, t
     // a signal or an error only wakes us early
     let _ = poll(&mut fds, Some(&timeout));
 }
+
+#[cfg(test)]
+mod tests;

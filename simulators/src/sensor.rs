@@ -279,3 +279,6 @@ impl View {
         self.scene.blocks(&ray, towards.length())
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -283,7 +283,8 @@ impl Controller {
         } else {
             self.ball(start, target).first_contact(&self.setup.scene)
         };
-        let touching = contact.is_some_and(|c| c.travel <= 0.0);
+        let touching = !self.setup.faults.no_contact
+            && self.ball(start, target).touches_at_start(&self.setup.scene);
         if touching != away {
             // for G38.2 and .3 it must not touch yet, for .4 and .5 it must
             self.locked = true;
@@ -339,8 +340,7 @@ impl Controller {
         let touches = |travel: f64| {
             let here = start + direction * travel;
             let ball = self.ball(here, here + direction * 1e-3);
-            ball.first_contact(&self.setup.scene)
-                .is_some_and(|c| c.travel <= 0.0)
+            ball.touches_at_start(&self.setup.scene)
         };
         if touches(length) {
             return None;

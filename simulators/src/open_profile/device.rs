@@ -50,6 +50,8 @@ struct Run {
     /// Real time of exposure 0.
     began: Instant,
     exposures: u32,
+    /// The next line was not computed in time.
+    late: bool,
 }
 
 /// The last run, under way or over.
@@ -321,6 +323,7 @@ impl Device {
             began_ns,
             began: now,
             exposures: 0,
+            late: false,
         });
         self.last = Some(Tally {
             run,
@@ -353,10 +356,8 @@ impl Device {
 
     /// Ends the run if there is one; the payload of STOPPED.
     fn stop(&mut self, reason: Reason) -> Vec<u8> {
-        if self.run.take().is_some() {
-            if let Some(last) = &mut self.last {
-                last.reason = reason;
-            }
+        if let (Some(_), Some(last)) = (self.run.take(), &mut self.last) {
+            last.reason = reason;
         }
         self.laser_on = false;
         self.publish();
@@ -523,8 +524,22 @@ impl Device {
                 return Next::Wait;
             }
             match run.feed.next() {
-                Fed::NotYet | Fed::Over => return Next::Wait,
-                Fed::Line(line) => self.expose(&line, out, full),
+                Fed::NotYet => {
+                    run.late = true;
+                    return Next::Wait;
+                }
+                Fed::Over => return Next::Wait,
+                Fed::Line(line) => {
+                    if std::mem::take(&mut run.late) {
+                        // the simulation was slow, not the device: its time stands still meanwhile
+                        run.began += now.saturating_duration_since(due);
+                    }
+                    self.expose(&line, out, full);
+                }
+            }
+            if paced {
+                // what is due next is looked at after this one was sent
+                return Next::At(now);
             }
         }
     }

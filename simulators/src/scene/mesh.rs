@@ -196,7 +196,7 @@ fn pierce(a: DVec3, b: DVec3, c: DVec3) -> Option<(f64, bool)> {
         let forward = (p.x, p.y) <= (q.x, q.y);
         let (s, e) = if forward { (p, q) } else { (q, p) };
         let value = s.x * e.y - s.y * e.x;
-        let left = value > 0.0 || (value == 0.0);
+        let left = value >= 0.0;
         (
             if forward { value } else { -value },
             if forward { left } else { !left },

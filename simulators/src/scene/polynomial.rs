@@ -60,7 +60,9 @@ fn collocation_inverse(n: usize) -> [[f64; 7]; 7] {
 /// Every place in 0..1 where the polynomial changes its sign, ascending.
 pub(crate) fn sign_changes<const N: usize>(coefficients: [f64; N]) -> Roots {
     let mut roots = Roots::new();
-    let mut stack: SmallVec<[([f64; N], f64, f64, u32); 16]> = SmallVec::new();
+    // coefficients, from, to, depth
+    type Piece<const N: usize> = ([f64; N], f64, f64, u32);
+    let mut stack: SmallVec<[Piece<N>; 16]> = SmallVec::new();
     stack.push((coefficients, 0.0, 1.0, 0));
     while let Some((c, from, to, depth)) = stack.pop() {
         match variations(&c) {
