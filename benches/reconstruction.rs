@@ -22,6 +22,53 @@ fn main() {
         figures::block_trial(if quick { 60_000 } else { 500_000 }),
         figures::lines_trial(if quick { 1.5 } else { 0.6 }),
     ];
+    if arguments.iter().any(|a| a == "hard") {
+        trials.clear();
+        for angle in [172.0, 165.0, 150.0, 120.0, 60.0, 40.0, 25.0] {
+            trials.push(figures::body_trial(
+                &format!("ridge {angle}"),
+                truth::ridge(angle),
+                8_000,
+                0.1,
+            ));
+        }
+        for gap in [0.3, 0.6, 1.0, 2.0] {
+            let unit = (800.0f64 / 8_000.0).sqrt();
+            trials.push(figures::body_trial(
+                &format!("plates {gap}"),
+                truth::plates(gap * unit),
+                8_000,
+                0.05,
+            ));
+        }
+        for width in [2.0, 4.0, 6.0] {
+            let unit = 0.25;
+            trials.push(figures::body_trial(
+                &format!("slot {width}"),
+                truth::slot(width * unit, width * unit),
+                8_000,
+                0.1,
+            ));
+        }
+        trials.push(figures::body_trial(
+            "block clean",
+            truth::stepped_block(),
+            60_000,
+            0.0,
+        ));
+        trials.push(figures::body_trial(
+            "block 0.3",
+            truth::stepped_block(),
+            60_000,
+            0.3,
+        ));
+        trials.push(figures::body_trial(
+            "block coarse",
+            truth::stepped_block(),
+            4_000,
+            0.1,
+        ));
+    }
     if let Some(only) = arguments.iter().find_map(|a| a.strip_prefix("only=")) {
         trials.retain(|t| t.name.contains(only));
     }

@@ -4,6 +4,7 @@ mod check;
 mod demo;
 mod devices;
 mod progress;
+mod reconstruct;
 
 use std::process::ExitCode;
 
@@ -22,6 +23,8 @@ pub enum Command {
     Check(check::Check),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
+    /// Take the points of a scan onto the surface they were measured from.
+    Reconstruct(reconstruct::Reconstruct),
 }
 
 impl Command {
@@ -34,6 +37,7 @@ impl Command {
             Command::Demo(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
+            Command::Reconstruct(command) => command.run(),
         }
     }
 }

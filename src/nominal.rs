@@ -73,8 +73,25 @@ pub struct Nominal {
     pub sharp_edges: Vec<SharpEdge>,
     /// What could not be used, and why.
     pub refused: Vec<Refused>,
-    /// Smallest and largest coordinates, mm.
+    /// Curves that bound no face: centre lines, sketches, construction geometry. Never measured.
+    pub wires: Vec<Wire>,
+    /// Smallest and largest coordinates of faces and wires, mm.
     pub bounding_box_mm: [DVec3; 2],
+    /// Smallest and largest coordinates of the faces alone, mm.
+    pub faces_box_mm: [DVec3; 2],
+}
+
+/// A bounded curve of a wireframe.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Wire {
+    /// Its number in the file.
+    pub entity: u64,
+    /// The whole curve.
+    pub curve: Curve,
+    /// Parameters of start and end.
+    pub range: (f64, f64),
+    /// In mm.
+    pub length_mm: f64,
 }
 
 /// A bounded curve where faces meet.

@@ -13,6 +13,7 @@ mod baseline;
 mod bulk;
 mod flank;
 mod levin;
+mod lines;
 mod polynomial;
 mod resample;
 mod robust;
@@ -25,7 +26,7 @@ use glam::{DMat3, DVec3, Vec3};
 use crate::points::{Neighbors, PointCloud};
 
 pub use baseline::{SmoothSurface, plane_normals, weighted_plane_normals};
-pub use bulk::{Reconstruction, reconstruct};
+pub use bulk::{LinePoint, Reconstruction, SharpPoint, reconstruct};
 use flank::{Arrangement, Nearest, Neighborhood};
 use levin::{LocalSurface, Smoothing};
 pub use polynomial::Degree;
@@ -122,6 +123,12 @@ impl Shared<'_> {
     }
 }
 
+/// Distance of samples along a feature line, in spacings of the points.
+const LINE_SPACING: f64 = 0.35;
+
+/// Places on feature lines near a query: the nearest, one to either side of it, and a corner.
+type Meetings = [Option<Nearest>; 4];
+
 /// Buffers of one worker.
 #[derive(Default)]
 struct Scratch {
@@ -135,7 +142,7 @@ struct Outcome {
     nearest: Nearest,
     /// The local approximation it lies on first, and the points that made it, in the scratch's `members`.
     local: LocalSurface,
-    meetings: [Option<Nearest>; 2],
+    meetings: Meetings,
 }
 
 impl<'a> Surface<'a> {
@@ -286,7 +293,7 @@ impl<'a> Surface<'a> {
                 sheets: 1,
             },
             local,
-            meetings: [None; 2],
+            meetings: Meetings::default(),
         })
     }
 
@@ -300,7 +307,15 @@ impl<'a> Surface<'a> {
         let flanks = hood.split(&self.scale, &smoothing);
         let arrangement = Arrangement::new(hood, &flanks, &self.scale);
         let mut nearest = arrangement.nearest()?;
-        let meetings = [arrangement.nearest_edge(), arrangement.nearest_corner()];
+        let edge = arrangement.nearest_edge();
+        let step = LINE_SPACING * self.scale.spacing_mm;
+        let beside = |way: f64| edge.and_then(|e| arrangement.along(&e, way * step));
+        let meetings = [
+            edge,
+            beside(1.0),
+            beside(-1.0),
+            arrangement.nearest_corner(),
+        ];
         let mut local = flanks[nearest.flanks[0]].local.clone();
         scratch.members.clear();
         scratch.members.extend(hood.members(nearest.flanks[0]));

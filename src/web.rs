@@ -9,7 +9,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Router;
-use axum::body::Body;
+use axum::body::{Body, Bytes};
 use axum::extract::{Request, State};
 use axum::http::header::{self, HeaderName, HeaderValue};
 use axum::http::{Method, Response, StatusCode};
@@ -23,10 +23,10 @@ use crate::report::{Report, content_security_policy};
 /// Everything that is shown of one inspection, ready to be sent.
 #[derive(Debug, Clone, Default)]
 pub struct Content {
-    html: Arc<str>,
-    json: Arc<str>,
-    csv: Arc<str>,
-    ply: Option<Arc<[u8]>>,
+    html: Bytes,
+    json: Bytes,
+    csv: Bytes,
+    ply: Option<Bytes>,
     made: String,
 }
 
@@ -153,14 +153,18 @@ fn newest(pages: &Pages) -> Option<Arc<Content>> {
 
 async fn page(State(pages): State<Pages>) -> Answer {
     match newest(&pages) {
-        Some(content) => text(StatusCode::OK, "text/html; charset=utf-8", &content.html),
+        Some(content) => answer_of(
+            StatusCode::OK,
+            "text/html; charset=utf-8",
+            content.html.clone(),
+        ),
         None => nothing_yet(),
     }
 }
 
 async fn json(State(pages): State<Pages>) -> Answer {
     match newest(&pages) {
-        Some(content) => text(StatusCode::OK, "application/json", &content.json),
+        Some(content) => answer_of(StatusCode::OK, "application/json", content.json.clone()),
         None => nothing_yet(),
     }
 }
@@ -168,7 +172,11 @@ async fn json(State(pages): State<Pages>) -> Answer {
 async fn csv(State(pages): State<Pages>) -> Answer {
     match newest(&pages) {
         Some(content) => {
-            let answer = text(StatusCode::OK, "text/csv; charset=utf-8", &content.csv);
+            let answer = answer_of(
+                StatusCode::OK,
+                "text/csv; charset=utf-8",
+                content.csv.clone(),
+            );
             named(answer, "attachment; filename=\"report.csv\"")
         }
         None => nothing_yet(),
@@ -181,11 +189,7 @@ async fn scan(State(pages): State<Pages>) -> Answer {
     };
     match &content.ply {
         Some(ply) => {
-            let mut answer = Response::new(Body::from(bytes_of(ply)));
-            answer.headers_mut().insert(
-                header::CONTENT_TYPE,
-                HeaderValue::from_static("application/octet-stream"),
-            );
+            let answer = answer_of(StatusCode::OK, "application/octet-stream", ply.clone());
             named(answer, "attachment; filename=\"scan.ply\"")
         }
         None => page_of_words(
@@ -196,10 +200,6 @@ async fn scan(State(pages): State<Pages>) -> Answer {
     }
 }
 
-fn bytes_of(shared: &Arc<[u8]>) -> axum::body::Bytes {
-    axum::body::Bytes::from_owner(Arc::clone(shared))
-}
-
 async fn health(State(pages): State<Pages>) -> Answer {
     let report = newest(&pages).map(|content| content.made.clone());
     let body = serde_json::json!({
@@ -207,7 +207,7 @@ async fn health(State(pages): State<Pages>) -> Answer {
         "version": env!("CARGO_PKG_VERSION"),
         "report": report,
     });
-    text(StatusCode::OK, "application/json", &body.to_string())
+    answer_of(StatusCode::OK, "application/json", body.to_string())
 }
 
 async fn unknown() -> Answer {
@@ -265,11 +265,11 @@ fn page_of_words(status: StatusCode, title: &str, sentence: &str) -> Answer {
          <li><a href=\"/report.json\">report.json</a></li><li><a href=\"/report.csv\">report.csv</a></li>\
          <li><a href=\"/scan.ply\">scan.ply</a></li><li><a href=\"/healthz\">healthz</a></li></ul></body></html>\n"
     );
-    text(status, "text/html; charset=utf-8", &page)
+    answer_of(status, "text/html; charset=utf-8", page)
 }
 
-fn text(status: StatusCode, kind: &'static str, body: &str) -> Answer {
-    let mut answer = Response::new(Body::from(body.to_owned()));
+fn answer_of(status: StatusCode, kind: &'static str, body: impl Into<Body>) -> Answer {
+    let mut answer = Response::new(body.into());
     *answer.status_mut() = status;
     answer
         .headers_mut()

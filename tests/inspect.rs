@@ -276,7 +276,7 @@ fn moved(cloud: &PointCloud, machine_from_part: &RigidTransform) -> PointCloud {
 #[test]
 fn a_rough_start_is_refined_to_within_its_covariance() {
     let (mut exact, mut made) = (0.0, 0.0);
-    const SEEDS: u64 = 12;
+    const SEEDS: u64 = 4;
     for seed in 1..=SEEDS {
         for with_deviations in [false, true] {
             let mut noise = Noise(seed);
@@ -317,21 +317,21 @@ fn a_rough_start_is_refined_to_within_its_covariance() {
             }
         }
     }
-    // Mean of 12 chi-squares of 6 degrees of freedom: 6, standard deviation 1; 4 of them.
+    // Mean of 4 chi-squares of 6 degrees of freedom: 6, standard deviation 1.7; 3 of them.
     let n = SEEDS as f64;
     println!(
         "mean chi-square: all faces {:.2}, datums {:.2}",
         exact / n,
         made / n
     );
-    assert!((2.0..10.0).contains(&(exact / n)), "{}", exact / n);
-    assert!((2.0..10.0).contains(&(made / n)), "{}", made / n);
+    assert!((0.9..11.1).contains(&(exact / n)), "{}", exact / n);
+    assert!((0.9..11.1).contains(&(made / n)), "{}", made / n);
 }
 
 #[test]
 fn faces_that_depart_widen_the_covariance() {
     let mut sum = 0.0;
-    for seed in 1..=12 {
+    for seed in 1..=6 {
         let mut noise = Noise(seed);
         let mut solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
         make(&mut solid, &mut noise);
@@ -350,8 +350,8 @@ fn faces_that_depart_widen_the_covariance() {
         );
         sum += squared;
     }
-    println!("mean {:.2}", sum / 12.0);
-    assert!(sum / 12.0 < 18.0);
+    println!("mean {:.2}", sum / 6.0);
+    assert!(sum / 6.0 < 18.0);
 }
 
 #[test]
@@ -422,4 +422,56 @@ fn touches_hold_what_the_scan_does_not() {
     println!("touches: {squared:.2}");
     // 0.999 quantile of chi-square with 6 degrees of freedom.
     assert!(squared < 22.5, "{squared}");
+}
+
+#[test]
+fn a_pose_is_found_from_nothing() {
+    for seed in 1..=3 {
+        let mut noise = Noise(seed);
+        let solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
+        let angle = 3.0 * noise.uniform();
+        let machine_from_part = noise.motion(angle, 200.0);
+        let cloud = moved(
+            &solid.scan(&[1, 2, 3, 4, 5, 6, 7], SIGMA, &mut noise),
+            &machine_from_part,
+        );
+        for known in [true, false] {
+            let mut cloud = cloud.clone();
+            if !known {
+                cloud.origins.clear();
+                cloud.views.clear();
+            }
+            let clock = std::time::Instant::now();
+            let aligned = align_scan(&solid, &cloud, Start::Auto, &AlignOptions::default());
+            println!("{:?} {:?}", clock.elapsed(), aligned.findings);
+            assert_eq!(
+                aligned.alignment.status,
+                Verdict::Ok,
+                "{:?}",
+                aligned.findings
+            );
+            let squared = mahalanobis(&aligned, &machine_from_part.inverse());
+            println!("seed {seed}, sensor known {known}: chi-square {squared:.2}");
+            // 0.999 quantile of chi-square with 6 degrees of freedom.
+            assert!(squared < 22.5, "seed {seed}: {squared}");
+        }
+    }
+}
+
+#[test]
+fn a_symmetric_part_is_ambiguous() {
+    let mut noise = Noise(2);
+    let solid = Solid::cuboid(20.0, 14.0, 10.0);
+    let scan = solid.scan(&[1, 2, 3, 4, 5], SIGMA, &mut noise);
+    let cloud = moved(&scan, &noise.motion(1.0, 50.0));
+    let aligned = align_scan(&solid, &cloud, Start::Auto, &AlignOptions::default());
+    assert_eq!(aligned.alignment.status, Verdict::NotDecidable);
+    assert!(
+        aligned
+            .findings
+            .iter()
+            .any(|f| f.starts_with("alignment: 4 poses fit the scan equally well")),
+        "a cuboid maps onto itself by the identity and three half turns: {:?}",
+        aligned.findings
+    );
 }

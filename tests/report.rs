@@ -134,6 +134,33 @@ fn a_page_of_fifty_edges_stays_below_one_and_a_half_megabytes() {
 }
 
 #[test]
+fn a_page_stays_readable_whatever_the_number_of_stations_holes_and_findings() {
+    let mut inspection = part::inspection(20_000);
+    inspection.edges.truncate(2);
+    for station in inspection.edges[0].stations.iter_mut().step_by(2) {
+        station.measured = None;
+        station.reason = "no points on flank 1".to_owned();
+    }
+    inspection.findings = (0..9_000).map(|i| format!("finding {i}")).collect();
+    inspection.unexpected_edges = vec![vec![glam::DVec3::ONE; 7]; 9_000];
+    let report = Report::new(&inspection, &part::facts());
+    let page = report.to_html();
+    assert!(page.len() < 2_500_000, "{} bytes", page.len());
+    for said in [
+        "drawn; the CSV and JSON forms hold all",
+        "and 8960 more, in the JSON form",
+        "more stretches",
+    ] {
+        assert!(page.contains(said), "{said}");
+    }
+    assert_eq!(
+        report.to_csv().lines().count(),
+        40_001,
+        "the table holds all"
+    );
+}
+
+#[test]
 fn the_page_is_kept_for_people_to_look_at() {
     let path = concat!(env!("CARGO_TARGET_TMPDIR"), "/report.html");
     std::fs::write(path, report().to_html()).expect("the target folder can be written");

@@ -209,3 +209,68 @@ fn usb_access(error: Option<rusb::Error>) -> Access {
     };
     Access::Refused(why.into())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn looking_never_fails_and_says_what_it_could_not_search() {
+        let found = attached();
+        assert!(found.serial.is_sorted_by(|a, b| a.path <= b.path));
+        for note in &found.notes {
+            assert!(
+                note.starts_with("USB cannot be searched (") || note.starts_with("serial ports: "),
+                "{note}"
+            );
+        }
+    }
+
+    #[test]
+    fn a_port_that_is_not_there_is_refused() {
+        let why = "nothing of this name is there; check cable, power and the name";
+        assert_eq!(access("/dev/no-such-port"), Access::Refused(why.into()));
+        let file = std::env::temp_dir().join(format!("acies-access-{}", std::process::id()));
+        std::fs::write(&file, "").expect("a file");
+        let found = access(file.to_str().expect("a UTF-8 path"));
+        std::fs::remove_file(&file).expect("the file removed");
+        assert_eq!(found, Access::Open);
+    }
+
+    #[test]
+    fn the_process_that_holds_a_port_is_named() {
+        let proc = std::env::temp_dir().join(format!("acies-proc-{}", std::process::id()));
+        let process = proc.join("4711");
+        std::fs::create_dir_all(process.join("fd")).expect("a folder");
+        std::fs::create_dir_all(proc.join("self/fd")).expect("a folder");
+        std::fs::write(process.join("comm"), "ModemManager\n").expect("a file");
+        std::os::unix::fs::symlink("/dev/ttyUSB7", process.join("fd/5")).expect("a link");
+        let found = holder(&proc, Path::new("/dev/ttyUSB7"));
+        let other = holder(&proc, Path::new("/dev/ttyUSB8"));
+        std::fs::remove_dir_all(&proc).expect("the folder removed");
+        assert_eq!(found.as_deref(), Some("ModemManager (process 4711)"));
+        assert_eq!(other, None);
+    }
+
+    #[test]
+    fn usb_refusals_say_what_to_do() {
+        let told = |error| match usb_access(Some(error)) {
+            Access::Open => "open".to_owned(),
+            Access::Refused(why) => why,
+        };
+        assert_eq!(usb_access(None), Access::Open);
+        assert_eq!(
+            told(rusb::Error::Access),
+            "this user may not open it; add a udev rule that gives it to a group of this user, then plug it in again"
+        );
+        assert_eq!(
+            told(rusb::Error::Busy),
+            "another program has it open; close that program, then retry"
+        );
+        assert_eq!(
+            told(rusb::Error::NoDevice),
+            "it is gone: unplugged a moment ago"
+        );
+        assert!(told(rusb::Error::NoMem).starts_with("opening failed: "));
+    }
+}

@@ -32,12 +32,6 @@ pub enum LinkError {
         /// The ports that match.
         ports: Vec<String>,
     },
-    /// The port does not take these line settings.
-    #[error("the port does not take {baud} Bd with this format; choose another `baud`")]
-    LineRefused {
-        /// Symbols a second that were asked for.
-        baud: u32,
-    },
     /// Nothing listens on the TCP port, or it has a client already.
     #[error("connection refused; check that the device listens there and has no other client")]
     Refused,
@@ -383,7 +377,6 @@ impl DeviceError {
                 LinkError::Denied { .. }
                     | LinkError::NotSerial
                     | LinkError::Ambiguous { .. }
-                    | LinkError::LineRefused { .. }
                     | LinkError::Departed { .. }
                     | LinkError::Recording(_)
             ),

@@ -64,6 +64,8 @@ struct Motion {
     feed_mm_min: f64,
     /// To the start of a touch with G0; otherwise with G1 at the probing feed.
     rapid: bool,
+    /// Machine z above everything: the way to a start goes up to it, across, and down.
+    safe_z_mm: Option<f64>,
     /// How far the tip goes back after contact.
     retract_mm: f64,
     /// Least and most of each axis that a touch may ask for.
@@ -77,6 +79,7 @@ fn configure(table: toml::Table) -> Configured {
     let motion = Motion {
         feed_mm_min: keys.number("feed_mm_min", 1.0..=5000.0).unwrap_or(100.0),
         rapid: keys.flag("rapid").unwrap_or(true),
+        safe_z_mm: keys.number("safe_z_mm", -1e4..=1e4),
         retract_mm: keys.number("retract_mm", 0.0..=100.0).unwrap_or(2.0),
         limits_mm: limits(&mut keys),
     };
@@ -309,6 +312,8 @@ impl Controller {
 
     /// Ends whatever ran before and waits for the start-up message; a controller that shows none may be fine.
     fn reset(&mut self) -> Result<(), DeviceError> {
+        // What lies there may be the message of an earlier start.
+        self.read(Instant::now(), |_| None::<()>)?;
         self.write(SOFT_RESET)?;
         let banner = self.read(Instant::now() + BOOT, |line| {
             matches!(line, Ok(Line::Banner(_))).then_some(())
@@ -316,8 +321,8 @@ impl Controller {
         if banner.is_none() {
             tracing::info!(port = self.port, "no start-up message; going on without");
         }
-        // Start-up lines and a note that it is locked may follow at once.
-        self.drain()
+        // Start-up lines may follow, and a second message where opening the port had reset the board already.
+        self.settle()
     }
 
     /// Takes in what comes within [`SETTLE`].
@@ -412,8 +417,12 @@ struct Frame {
 impl Frame {
     /// G-code words of a place in machine axes.
     fn words(&self, machine_mm: [f64; 3]) -> String {
-        let [x, y, z] = [0, 1, 2].map(|axis| machine_mm[axis] - self.work_offset_mm[axis]);
+        let [x, y, z] = self.work_mm(machine_mm);
         format!("X{x:.4} Y{y:.4} Z{z:.4}")
+    }
+
+    fn work_mm(&self, machine_mm: [f64; 3]) -> [f64; 3] {
+        [0, 1, 2].map(|axis| machine_mm[axis] - self.work_offset_mm[axis])
     }
 
     fn machine_mm(&self, reported: [f64; 3]) -> [f64; 3] {
@@ -581,13 +590,32 @@ impl GrblProbe {
             return Ok(());
         }
         let to = [0, 1, 2].map(|axis| contact_mm[axis] - back_mm * way.direction[axis]);
-        let text = self.travel(to);
+        let text = self.travel(&self.frame.words(to));
         let outcome = self.motion(&text, Limit::from_now(RETRACT), |_| {})?;
         self.controller.checked("G0", outcome)
     }
 
-    fn travel(&self, to_mm: [f64; 3]) -> String {
-        let words = self.frame.words(to_mm);
+    /// Goes to the start: straight, or over the safe height where one is set.
+    fn go_to(&mut self, start_mm: [f64; 3], limit: Limit) -> Result<(), DeviceError> {
+        let [x, y, z] = self.frame.work_mm(start_mm);
+        let legs = match self.motion.safe_z_mm {
+            None => vec![self.frame.words(start_mm)],
+            Some(safe_z_mm) => {
+                let high_mm = safe_z_mm.max(start_mm[2]);
+                let high = self.frame.work_mm([0.0, 0.0, high_mm])[2];
+                let up = format!("Z{high:.4}");
+                vec![up, format!("X{x:.4} Y{y:.4}"), format!("Z{z:.4}")]
+            }
+        };
+        for leg in legs {
+            let text = self.travel(&leg);
+            let outcome = self.motion(&text, limit, |_| {})?;
+            self.controller.checked("G0", outcome)?;
+        }
+        Ok(())
+    }
+
+    fn travel(&self, words: &str) -> String {
         if self.motion.rapid {
             format!("G0 {words}")
         } else {
@@ -617,9 +645,7 @@ impl Probe for GrblProbe {
             });
         }
         let limit = Limit::from_now(timeout);
-        let text = self.travel(start_mm);
-        let outcome = self.motion(&text, limit, |_| {})?;
-        self.controller.checked("G0", outcome)?;
+        self.go_to(start_mm, limit)?;
         let tip_centre_mm = self.probe(&way, limit)?;
         let host_time = Instant::now();
         self.retract(&way, tip_centre_mm)?;

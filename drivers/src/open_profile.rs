@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
 use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
-use crate::error::{DecodeError, DeviceError};
+use crate::error::{DecodeError, DeviceError, LinkError};
 use crate::link::{Link, Links, Target};
 use crate::settings::Keys;
 
@@ -140,7 +140,7 @@ impl Setup for Settings {
                 port: port.clone(),
                 source,
             })?;
-        let mut device = OpenProfile::new(port, link, self.keepalive);
+        let mut device = OpenProfile::new(port, link, self.keepalive)?;
         device.introduce(self.serial_number.as_deref())?;
         for wanted in &self.wanted {
             device.set(wanted)?;
@@ -165,13 +165,26 @@ struct OpenProfile {
 }
 
 impl OpenProfile {
-    fn new(port: String, link: Arc<dyn Link>, keepalive: Duration) -> OpenProfile {
+    fn new(
+        port: String,
+        link: Arc<dyn Link>,
+        keepalive: Duration,
+    ) -> Result<OpenProfile, DeviceError> {
         let shared = Arc::new(Shared::new());
         let thread = {
             let (link, shared) = (Arc::clone(&link), Arc::clone(&shared));
-            std::thread::spawn(move || stream::run(&link, &shared))
+            std::thread::Builder::new()
+                .name("open-profile".into())
+                .spawn(move || stream::run(&link, &shared))
         };
-        OpenProfile {
+        let thread = thread.map_err(|source| DeviceError::Link {
+            port: port.clone(),
+            source: LinkError::Io {
+                action: "starting its thread",
+                source,
+            },
+        })?;
+        Ok(OpenProfile {
             port,
             link,
             shared,
@@ -186,7 +199,7 @@ impl OpenProfile {
             has_encoder: false,
             last_id: 0,
             last_run: 0,
-        }
+        })
     }
 
     /// Stops what a host before us may have left running, and learns who the device is.
@@ -386,15 +399,15 @@ impl Profiler for OpenProfile {
     }
 
     fn start(&mut self) -> Result<(), DeviceError> {
-        let running = self.shared.lock().run.is_some();
-        if running {
+        let run = self.shared.lock().run;
+        if run.is_some_and(|run| run.stopped.is_none()) {
             return Err(DeviceError::OutOfOrder {
                 port: self.port.clone(),
                 action: "start",
                 needed: "the run before to be stopped",
             });
         }
-        self.last_run = self.last_run.wrapping_add(1);
+        self.last_run = self.last_run.wrapping_add(1).max(1);
         self.shared.lock().begin(self.last_run, self.keepalive);
         let started = self.start_run(self.last_run);
         if started.is_err() {

@@ -6,7 +6,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
-use super::flanks::{Crease, FAR, Verdict, Workshop};
+use super::flanks::{Crease, FAR, Verdict, Workshop, overlooked_turn};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
 use crate::points::Neighbors;
@@ -18,7 +18,7 @@ const MODEL_ERROR: f64 = 0.025;
 /// A point is marked when the edge passes within this many spacings.
 const THIN: f64 = 0.9;
 /// Share of the neighbours that must see an edge for it to be believed.
-const AGREEMENT: f64 = 0.3;
+fn agreement() -> f64 { std::env::var("AGR").map_or(0.3, |v| v.parse().unwrap()) }
 
 /// What the detector works on: distinct places in Morton order.
 pub(super) struct Places<'a> {
@@ -103,20 +103,22 @@ impl Places<'_> {
     /// What is seen from the candidate `rank`, by growing its neighbourhood until the answer is clear.
     pub fn look(&self, tangents: &Tangents, rank: usize, shop: &mut Bench) -> Option<Sight> {
         let p = self.positions[rank];
-        let mut guess = None;
+        let mut most_turn = std::f64::consts::PI;
         for level in LEVELS {
             self.neighbors.nearest_places(p, level, &mut shop.found);
             drop_ties(&mut shop.found);
             let reach = shop.found.last().map_or(0.0, |f| f.1.sqrt());
             let unit = self.unit_mm(reach, shop.found.len());
             self.fill(tangents, p, unit, shop);
-            match shop.flanks.analyse(self.variance(unit)) {
+            let variance = self.variance(unit);
+            match shop.flanks.analyse(variance, most_turn) {
                 Verdict::Smooth => return None,
                 Verdict::Creased(crease) => return Some(in_mm(crease, unit)),
-                Verdict::Unsure(crease) => guess = crease.map(|c| in_mm(c, unit)),
+                Verdict::Unsure => {
+                    most_turn = overlooked_turn(variance, shop.found.len(), reach / unit);
+                }
             }
         }
-        let _ = guess;
         None
     }
 
@@ -146,11 +148,7 @@ impl Places<'_> {
         let apart = APART * reach / 3.57;
         for (_, i) in &shop.ranked {
             let at = shop.flanks.points[*i as usize];
-            if shop
-                .taken
-                .iter()
-                .all(|t: &DVec3| t.distance_squared(at) > apart * apart)
-            {
+            if shop.taken.iter().all(|t: &DVec3| t.distance_squared(at) > apart * apart) {
                 shop.taken.push(at);
                 let plane = &tangents.planes[shop.found[*i as usize].0 as usize];
                 let normal = plane.normal();
@@ -170,25 +168,23 @@ impl Places<'_> {
         let p = self.positions[rank];
         let around = tangents.around(rank);
         let unit = self.unit_mm(f64::from(tangents.planes[rank].reach_mm), around.len());
-        let mut seen: [(DVec3, Sight); super::tangent::NEAR] =
-            [(DVec3::ZERO, NOTHING); super::tangent::NEAR];
-        let mut count = 0;
-        for j in around {
-            if let Some(sight) = sights.at(*j as usize) {
-                let foot = (self.positions[*j as usize] + sight.foot - p) / unit;
-                if foot.length_squared() < FAR * FAR {
-                    seen[count] = (foot, *sight);
-                    count += 1;
-                }
-            }
+        let mut witnesses = [Witness::default(); super::tangent::NEAR];
+        let mut seeing = 0;
+        for (witness, j) in witnesses.iter_mut().zip(around) {
+            let at = (self.positions[*j as usize] - p) / unit;
+            let sight = sights.at(*j as usize).map(|s| (at + s.foot / unit, *s));
+            seeing += usize::from(sight.is_some());
+            *witness = Witness { at, sight };
         }
-        let seen = &seen[..count];
-        let needed = ((around.len() as f64 * AGREEMENT) as usize).max(3);
+        if seeing < 3 {
+            return None;
+        }
+        let witnesses = &witnesses[..around.len()];
         let mut best: Option<Agreed> = None;
-        for (foot, sight) in seen.iter().take(8) {
-            let (votes, at) = fit_feet(seen, (*foot, sight.tangent), unit)?;
+        for (foot, sight) in witnesses.iter().filter_map(|w| w.sight).take(8) {
+            let (share, at) = fit_feet(witnesses, (foot, sight.tangent), unit);
             let distance = at.length();
-            if votes >= needed && best.is_none_or(|b| distance < b.distance) {
+            if share >= agreement() && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
                     foot: at * unit,
                     tangent: sight.tangent,
@@ -208,11 +204,9 @@ impl Places<'_> {
             Some((self.positions[*j as usize] + c - p) / unit)
         });
         let (mut sum, mut n) = (DVec3::ZERO, 0);
-        let nearest =
-            corners.clone().fold(
-                DVec3::INFINITY,
-                |a, b| if b.length() < a.length() { b } else { a },
-            );
+        let nearest = corners
+            .clone()
+            .fold(DVec3::INFINITY, |a, b| if b.length() < a.length() { b } else { a });
         for c in corners.filter(|c| c.distance_squared(nearest) < 1.5) {
             sum += c;
             n += 1;
@@ -221,52 +215,55 @@ impl Places<'_> {
     }
 }
 
-const NOTHING: Sight = Sight {
-    foot: DVec3::ZERO,
-    tangent: DVec3::ZERO,
-    turn: 0.0,
-    sd_mm: 0.0,
-    corner: None,
-};
+/// A neighbour and the edge it sees, both relative to the place in question, in spacings; the sight itself in mm.
+#[derive(Clone, Copy, Default)]
+struct Witness {
+    at: DVec3,
+    sight: Option<(DVec3, Sight)>,
+}
 
-/// How many feet lie along one curve with the reference, and where that curve passes: quadratic in the way along the tangent.
-fn fit_feet(
-    seen: &[(DVec3, Sight)],
-    (foot, tangent): (DVec3, DVec3),
-    unit: f64,
-) -> Option<(usize, DVec3)> {
+/// The share of the witnesses who see the reference edge among those near enough to it, and where it passes: quadratic in the way along
+/// the tangent.
+fn fit_feet(witnesses: &[Witness], (foot, tangent): (DVec3, DVec3), unit: f64) -> (f64, DVec3) {
+    const NEAR: f64 = 1.8;
     let mut a = [[0.0; 3]; 3];
     let mut b = [DVec3::ZERO; 3];
-    let mut votes = 0;
-    for (f, s) in seen {
-        let d = *f - foot;
-        let along = d.dot(tangent);
-        let off = d - tangent * along;
+    let (mut votes, mut expected) = (0u32, 0u32);
+    for witness in witnesses {
+        let to_edge = witness.at - foot;
+        let across = to_edge - tangent * to_edge.dot(tangent);
+        let near = across.length_squared() < NEAR * NEAR;
+        expected += u32::from(near);
+        let Some((f, s)) = witness.sight else {
+            continue;
+        };
+        let d = f - foot;
+        let off = d - tangent * d.dot(tangent);
         if s.tangent.dot(tangent).abs() < 0.8 || off.length_squared() > 1.0 {
             continue;
         }
-        votes += 1;
+        votes += u32::from(near);
         let x = f.dot(tangent);
         let sd = s.sd_mm / unit;
         let w = (-0.25 * x * x).exp() / (sd * sd + 0.05 * 0.05);
         let row = [1.0, x, x * x];
         for i in 0..3 {
-            b[i] += (*f - tangent * x) * (w * row[i]);
+            b[i] += (f - tangent * x) * (w * row[i]);
             for j in 0..3 {
                 a[i][j] += w * row[i] * row[j];
             }
         }
     }
+    let share = if votes < 3 { 0.0 } else { f64::from(votes) / f64::from(expected) };
     // Bending is held back a little, so that few feet give a straight line.
     a[1][1] += 0.02 * a[0][0];
     a[2][2] += 0.1 * a[0][0];
     let m = glam::DMat3::from_cols_array_2d(&a);
-    let det = m.determinant();
-    if det <= 1e-12 * a[0][0].powi(3) {
-        return Some((votes, b[0] / a[0][0]));
+    if m.determinant() <= 1e-12 * a[0][0].powi(3) {
+        return (share, b[0] / a[0][0]);
     }
     let first = m.inverse().row(0);
-    Some((votes, b[0] * first.x + b[1] * first.y + b[2] * first.z))
+    (share, b[0] * first.x + b[1] * first.y + b[2] * first.z)
 }
 
 /// What each candidate sees.

@@ -13,10 +13,21 @@ const STRAY: u8 = u8::MAX;
 /// A crease is believed where the criterion prefers it by this much, and disbelieved where it is against it by [`AGAINST`].
 const DECISIVE: f64 = 10.0;
 const AGAINST: f64 = 6.0;
+/// Surfaces are merged unless the criterion is against it by more than this.
+const SLIGHT: f64 = 2.0;
 /// Smallest turn angle, rad, that counts as sharp: 6 degrees.
 const LEAST_TURN: f64 = 0.105;
 /// Farthest foot, in spacings, that is of interest.
 pub(super) const FAR: f64 = 2.6;
+
+/// The largest turn angle, rad, of which a neighbourhood of `count` points within `reach` spacings can have failed to show clear
+/// evidence.
+///
+/// A crease of turn a through the middle departs from the best quadric by 0.09 reach tan(a / 2) in the mean square.
+pub(super) fn overlooked_turn(variance: f64, count: usize, reach: f64) -> f64 {
+    let missed = (4.0 * DECISIVE * variance / count as f64).sqrt();
+    2.0 * (missed / (0.09 * reach)).atan()
+}
 
 /// An edge as one neighbourhood sees it, relative to its point, in spacings.
 #[derive(Debug, Clone, Copy)]
@@ -38,8 +49,8 @@ pub(super) struct Crease {
 pub(super) enum Verdict {
     /// One smooth surface, or an edge too far away to be of interest.
     Smooth,
-    /// Neither can be excluded: a larger neighbourhood is needed. Holds the better guess.
-    Unsure(Option<Crease>),
+    /// Neither can be excluded: a larger neighbourhood is needed.
+    Unsure,
     /// An edge.
     Creased(Crease),
 }
@@ -58,7 +69,9 @@ pub(super) struct Workshop {
 
 impl Workshop {
     /// What the neighbourhood in `points` is, at noise of variance `variance` (spacings squared).
-    pub fn analyse(&mut self, variance: f64) -> Verdict {
+    ///
+    /// `most_turn` (rad) is what smaller neighbourhoods, which saw no clear edge, have left possible.
+    pub fn analyse(&mut self, variance: f64, most_turn: f64) -> Verdict {
         if self.points.len() < 8 {
             return Verdict::Smooth;
         }
@@ -73,16 +86,12 @@ impl Workshop {
         let (fits, doubt) = self.merge(planes.len() as u8, variance);
         if fits.len() < 2 {
             return if doubt < AGAINST {
-                Verdict::Unsure(None)
+                Verdict::Unsure
             } else {
                 Verdict::Smooth
             };
         }
-        match self.nearest_crease(fits, variance) {
-            None => Verdict::Smooth,
-            Some(crease) if doubt < DECISIVE => Verdict::Unsure(Some(crease)),
-            Some(crease) => Verdict::Creased(crease),
-        }
+        self.nearest_crease(&fits, (variance, most_turn))
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -110,13 +119,7 @@ impl Workshop {
             self.seeds.push(Plane::through(
                 self.near[..k].iter().map(|(_, i)| points[*i as usize]),
             ));
-            at = (0..n).fold(0, |best, i| {
-                if self.costs[i] > self.costs[best] {
-                    i
-                } else {
-                    best
-                }
-            });
+            at = (0..n).fold(0, |best, i| if self.costs[i] > self.costs[best] { i } else { best });
         }
     }
 
@@ -126,11 +129,8 @@ impl Workshop {
         let cap = 9.0 * variance;
         self.costs.clear();
         for seed in &self.seeds {
-            self.costs.extend(
-                self.points
-                    .iter()
-                    .map(|p| seed.distance(*p).powi(2).min(cap)),
-            );
+            self.costs
+                .extend(self.points.iter().map(|p| seed.distance(*p).powi(2).min(cap)));
         }
         let row = |s: usize| &self.costs[s * n..(s + 1) * n];
         let single = (0..self.seeds.len())
@@ -158,11 +158,7 @@ impl Workshop {
             .collect();
         while chosen.len() < MOST_PLANES {
             let gain = |s: usize| -> f64 {
-                row(s)
-                    .iter()
-                    .zip(&so_far)
-                    .map(|(a, b)| (b - a).max(0.0))
-                    .sum()
+                row(s).iter().zip(&so_far).map(|(a, b)| (b - a).max(0.0)).sum()
             };
             let (s, g) = (0..self.seeds.len())
                 .map(|s| (s, gain(s)))
@@ -209,8 +205,7 @@ impl Workshop {
         let mut fits: Vec<(u8, Fit)> = (0..count)
             .filter_map(|s| {
                 let members = self.labels.iter().filter(|l| **l == s).count();
-                (members >= 4)
-                    .then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
+                (members >= 4).then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
                     .map(|f| (s, f))
             })
             .collect();
@@ -229,14 +224,11 @@ impl Workshop {
                     }
                 }
             }
-            let Some((change, i, j, union)) = best else {
-                break;
-            };
-            if change > 0.0 {
-                doubt = change;
+            let Some((change, i, j, union)) = best else { break };
+            if change > SLIGHT {
                 break;
             }
-            doubt = -change;
+            doubt = doubt.min(SLIGHT - change);
             let (from, to) = (fits[i].0, fits[j].0);
             for label in self.labels.iter_mut().filter(|l| **l == from) {
                 *label = to;
@@ -278,31 +270,41 @@ impl Workshop {
         Some((parts, whole))
     }
 
-    /// The nearest believable crease between two of the surfaces.
-    fn nearest_crease(&mut self, fits: Vec<(u8, Fit)>, variance: f64) -> Option<Crease> {
+    /// The nearest decisive crease between two of the surfaces.
+    fn nearest_crease(&self, fits: &[(u8, Fit)], (variance, most_turn): (f64, f64)) -> Verdict {
         let mut best: Option<(f64, Crease)> = None;
-        let several = fits.len() > 2;
+        let mut unsure = false;
         for i in 0..fits.len() {
             for j in 0..i {
-                let Some(crease) = self.crease(&fits[i], &fits[j], variance) else {
+                let Some((crease, evidence)) = self.crease(&fits[i], &fits[j], variance) else {
                     continue;
                 };
+                if evidence < DECISIVE || crease.turn > most_turn {
+                    unsure |= evidence > -AGAINST && crease.turn <= most_turn;
+                    continue;
+                }
                 let d = crease.foot.length();
                 if best.as_ref().is_none_or(|b| d < b.0) {
                     best = Some((d, crease));
                 }
             }
         }
-        let (_, mut crease) = best?;
-        if several {
-            crease.corner = self.corner(&fits);
+        match best {
+            Some((_, mut crease)) => {
+                crease.corner = if fits.len() > 2 { self.corner(fits) } else { None };
+                Verdict::Creased(crease)
+            }
+            None if unsure => Verdict::Unsure,
+            None => Verdict::Smooth,
         }
-        Some(crease)
     }
 
-    /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt.
-    fn crease(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<Crease> {
-        let (fits, _) = self.split(one, other, variance)?;
+    /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt; and by how much the
+    /// criterion prefers it to one smooth surface.
+    fn crease(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<(Crease, f64)> {
+        let (fits, whole) = self.split(one, other, variance)?;
+        let evidence =
+            whole.criterion(variance) - fits[0].criterion(variance) - fits[1].criterion(variance);
         let surfaces = [fits[0].surface, fits[1].surface];
         let (e, tangent) = foot(&surfaces[0], &surfaces[1], DVec3::ZERO)?;
         if e.length_squared() > FAR * FAR {
@@ -324,15 +326,15 @@ impl Workshop {
             slope += if bent { 192.0 } else { 12.0 } / (n * length2);
         }
         let turn_sd = (variance * slope).sqrt();
-        let believable =
-            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
-        believable.then_some(Crease {
+        let believable = turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        let crease = Crease {
             foot: e,
             tangent,
             turn,
             sd: (variance * place).sqrt() / sine,
             corner: None,
-        })
+        };
+        believable.then_some((crease, evidence))
     }
 
     /// Unit directions from the foot into each surface, across the edge.
@@ -363,9 +365,7 @@ impl Workshop {
         const NEAR: f64 = 2.1;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
-                .filter(|i| {
-                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
-                })
+                .filter(|i| self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR)
                 .count();
             near >= 2
         })

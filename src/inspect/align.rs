@@ -8,29 +8,33 @@
 mod search;
 mod twist;
 
+use std::collections::BTreeMap;
+
 use glam::DVec3;
 use nalgebra::{Matrix6, SymmetricEigen, Vector6};
 use rayon::prelude::*;
 
 use super::assign::{NO_FACE, Surface, towards};
 use super::body::Body;
-use super::clusters::Clusters;
+use super::clusters::SIGNIFICANT;
 use super::measure::pose_row;
 use super::result::{Alignment, Verdict};
 use crate::geometry::RigidTransform;
-use crate::geometry::fit::{LinearFit, mad_sigma, median};
+use crate::geometry::fit::{mad_sigma, median};
 use crate::points::{Neighbors, PointCloud, Spacing};
 
 pub use twist::Twist;
 
 /// Points of the final fit: more do not make the pose better than the form of the faces allows.
-const FINAL_POINTS: usize = 40_000;
+const FINAL_POINTS: usize = 20_000;
 
 /// Points of the coarse steps.
 const COARSE_POINTS: usize = 2_000;
 
 /// Tukey's constant: 95 % efficient on normal noise.
 const TUKEY: f64 = 4.685;
+
+const TOO_FEW: &str = "alignment: fewer than 20 points lie near the nominal, expected most of the scan; give a better start";
 
 /// What is known of the pose beforehand.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -223,25 +227,11 @@ impl<B: Body> Task<'_, B> {
 
     /// Follows the pose down, coarse to fine, and says how well it is known.
     fn refine_and_judge(&self, start: RigidTransform, findings: Vec<String>) -> Aligned {
-        let coarse = self.scan.subset(COARSE_POINTS);
+        let Some((mut pose, _)) = self.coarse(start, (COARSE_POINTS, 30)) else {
+            return self.failed(TOO_FEW.to_string());
+        };
         let fine = self.scan.subset(FINAL_POINTS);
-        let mut pose = start;
-        let mut gate = 0.3 * self.size_mm;
-        // The gate narrows to where only the part itself is left: fixtures and reflections lie further away.
-        for _ in 0..30 {
-            let observations = self.observe(&pose, &coarse, gate);
-            let Some(step) = self.solve(&observations) else {
-                return self.failed(
-                    "alignment: too few points near the nominal; give a better start".to_string(),
-                );
-            };
-            pose = step.twist.transform() * pose;
-            let wanted = (6.0 * step.sigma).max(10.0 * self.scan.noise_mm);
-            gate = (0.7 * gate).max(wanted.max(0.01 * self.size_mm));
-            if step.twist.size(self.size_mm) < 0.1 * self.scan.noise_mm.max(1e-6 * self.size_mm) {
-                break;
-            }
-        }
+        let gate = (0.01 * self.size_mm).max(10.0 * self.scan.noise_mm);
         let mut last = None;
         for _ in 0..12 {
             let observations = self.observe(&pose, &fine, gate);
@@ -253,7 +243,7 @@ impl<B: Body> Task<'_, B> {
             pose = step.twist.transform() * pose;
             let moved = step.twist.size(self.size_mm);
             last = Some((observations, step));
-            if moved < 1e-3 * self.scan.noise_mm.max(1e-9 * self.size_mm) {
+            if moved < 5e-3 * self.scan.noise_mm.max(1e-9 * self.size_mm) {
                 break;
             }
         }
@@ -261,6 +251,43 @@ impl<B: Body> Task<'_, B> {
             Some((observations, step)) => self.judge(pose, &observations, &step, findings),
             None => self.failed("alignment: no step was made".to_string()),
         }
+    }
+
+    /// The pose that a few points settle on from `start`, and the directions that they do not hold.
+    ///
+    /// `effort` is the number of points and of steps at most.
+    fn coarse(
+        &self,
+        start: RigidTransform,
+        effort: (usize, usize),
+    ) -> Option<(RigidTransform, Vec<Twist>)> {
+        let few = self.scan.subset(effort.0);
+        let mut pose = start;
+        let mut weak = Vec::new();
+        let mut gate = 0.3 * self.size_mm;
+        let noise = self.scan.noise_mm.max(1e-6 * self.size_mm);
+        // The gate narrows to where only the part itself is left: fixtures and reflections lie further away.
+        for _ in 0..effort.1 {
+            let step = self.solve(&self.observe(&pose, &few, gate))?;
+            pose = step.twist.transform() * pose;
+            gate = (0.7 * gate)
+                .max(6.0 * step.sigma)
+                .max(10.0 * noise)
+                .max(0.01 * self.size_mm);
+            weak = self.twists(&step);
+            if step.twist.size(self.size_mm) < 0.1 * noise {
+                break;
+            }
+        }
+        Some((pose, weak))
+    }
+
+    fn twists(&self, step: &Step) -> Vec<Twist> {
+        let scaling = self.scaling();
+        step.weak
+            .iter()
+            .map(|v| Twist::from_array(std::array::from_fn(|k| v[k] * scaling[k])))
+            .collect()
     }
 
     /// One Gauss-Newton step; `None` for fewer than 20 observations.
@@ -334,12 +361,7 @@ impl<B: Body> Task<'_, B> {
         mut findings: Vec<String>,
     ) -> Aligned {
         let covariance = self.covariance(observations, step);
-        let scaling = self.scaling();
-        let twists: Vec<Twist> = step
-            .weak
-            .iter()
-            .map(|v| Twist::from_array(std::array::from_fn(|k| v[k] * scaling[k])))
-            .collect();
+        let twists = self.twists(step);
         let weak_directions: Vec<String> = twist::words(&twists, self.size_mm);
         let mut status = Verdict::Ok;
         if let Some(id) = self.moved_edge(&twists) {
@@ -404,51 +426,22 @@ impl<B: Body> Task<'_, B> {
         let Some(inverse) = held.try_inverse() else {
             return self.failed(String::new()).alignment.covariance;
         };
-        let cofactor: [[f64; 6]; 6] =
-            std::array::from_fn(|i| std::array::from_fn(|j| inverse[(i, j)]));
-        let fit = LinearFit {
-            coefficients: [0.0; 6],
-            cofactor,
-            residual_sum: 0.0,
-            used: observations.len(),
+        let form_by = |group: fn(&Observation, f64) -> u64| {
+            form(
+                observations,
+                (step, &inverse),
+                |o| group(o, self.size_mm),
+                &scaling,
+            )
         };
-        let patch_mm = self.size_mm / 3.0;
-        let groups = |by_patch: bool| {
-            let samples = observations
-                .iter()
-                .zip(&step.weights)
-                .filter_map(move |(o, w)| {
-                    if *w <= 0.0 || o.u_mm > 0.0 {
-                        return None;
-                    }
-                    let cell = (o.point / patch_mm).floor().as_i64vec3();
-                    let patch = (cell.x * 31 + cell.y) * 31 + cell.z;
-                    let group = if by_patch {
-                        o.face.wrapping_mul(100_003).wrapping_add(patch as u32) >> 1
-                    } else {
-                        o.face
-                    };
-                    let root = w.sqrt();
-                    let row = std::array::from_fn(|k| root * o.row[k] * scaling[k]);
-                    Some((group, row, root * o.residual_mm))
-                });
-            Clusters::<6>::new(samples, &fit)
-        };
-        let faces = groups(false);
-        let patches = groups(true);
-        let component = |c: &Clusters<6>| c.components().map_or(0.0, |(_, shared)| shared);
-        let grown = |c: &Clusters<6>| {
-            let scatter = Matrix6::from_fn(|i, j| c.scatter[i][j]);
-            component(c) * inverse * scatter * inverse
-        };
-        let (by_face, by_patch) = (grown(&faces), grown(&patches));
-        let form = if by_face.trace() > by_patch.trace() {
+        let by_face = form_by(|o, _| u64::from(o.face));
+        let by_patch = form_by(patch_of);
+        let larger = if by_face.trace() > by_patch.trace() {
             by_face
         } else {
             by_patch
         };
-        let white = self.white_variance(observations, step);
-        let mut scaled = inverse * white + form;
+        let mut scaled = inverse * self.white_variance(observations, step) + larger;
         for weak in &step.weak {
             scaled += weak * weak.transpose() * self.size_mm.powi(2);
         }
@@ -467,6 +460,62 @@ impl<B: Body> Task<'_, B> {
         // E[w e^2] / E[w] of Tukey's weights on normal noise is 0.80; the variance of the estimate over sigma^2 / sum(w) is 0.85.
         1.06 * sum / weight.max(1.0)
     }
+}
+
+/// The patch of its face that an observation lies on, a third of the part's half-diagonal wide.
+fn patch_of(o: &Observation, size_mm: f64) -> u64 {
+    let foot = o.point - o.residual_mm * DVec3::new(o.row[3], o.row[4], o.row[5]);
+    // Shifted off the planes through the origin, on which the foot's rounding would choose the cell.
+    let cell = (3.0 * foot / size_mm + 0.377).floor().as_i64vec3();
+    let place = (cell.x.wrapping_mul(0x1F_FFF7) ^ cell.y.wrapping_mul(0x3F_FF1D)) ^ cell.z;
+    u64::from(o.face) << 40 | (place as u64 & 0xFF_FFFF_FFFF)
+}
+
+/// What the pose may be off because faces, or patches of them, depart from the nominal by amounts that nobody knows.
+///
+/// Every group is taken to be shifted at random; the variance of the shifts is estimated from the mean residuals of *all*
+/// groups, those that the robust fit turned down included: which of two opposite faces is off cannot be told from the scan.
+/// Where no group is redundant (three datum faces) the shifts cannot be seen, and the groups define the frame.
+fn form(
+    observations: &[Observation],
+    (step, inverse): (&Step, &Matrix6<f64>),
+    group: impl Fn(&Observation) -> u64,
+    scaling: &[f64; 6],
+) -> Matrix6<f64> {
+    // By group: weighted sum of rows, sum of weights, sum of residuals, of their squares, count.
+    let mut groups: BTreeMap<u64, (Vector6<f64>, f64, [f64; 3])> = BTreeMap::new();
+    for (o, w) in observations.iter().zip(&step.weights) {
+        if o.u_mm > 0.0 {
+            continue;
+        }
+        let entry = groups.entry(group(o)).or_default();
+        entry.0 += *w * Vector6::from_fn(|k, _| o.row[k] * scaling[k]);
+        entry.1 += w;
+        entry.2[0] += o.residual_mm;
+        entry.2[1] += o.residual_mm.powi(2);
+        entry.2[2] += 1.0;
+    }
+    let total = observations.len() as f64;
+    let (mut square, mut expected, mut freedom) = (0.0, 0.0, 0.0);
+    let mut scatter = Matrix6::zeros();
+    for (rows, weight, [sum, sum_square, count]) in groups.values() {
+        scatter += rows * rows.transpose();
+        // A handful of stray points is no face.
+        if *count < 20.0f64.max(0.002 * total) {
+            continue;
+        }
+        let mean = sum / count;
+        let leverage = (rows.transpose() * inverse * rows)[0] / weight.max(1e-9);
+        let left = (1.0 - leverage).clamp(0.0, 1.0);
+        square += mean * mean;
+        expected += left * (sum_square / count - mean * mean).max(0.0) / count;
+        freedom += left;
+    }
+    let excess = square - expected;
+    if freedom < 0.5 || excess < SIGNIFICANT * expected * (2.0 / freedom).sqrt() {
+        return Matrix6::zeros();
+    }
+    inverse * scatter * inverse * (excess / freedom)
 }
 
 /// A Gauss-Newton step.

@@ -34,19 +34,22 @@ pub struct Place {
     pub deviation_mm: f64,
     /// Outward normal at the foot.
     pub normal: DVec3,
+    /// Distance to the face within its boundary, mm; beyond the boundary good to the sampling.
+    pub distance_mm: f64,
 }
 
 const NOWHERE: Place = Place {
     face: NO_FACE,
     deviation_mm: 0.0,
     normal: DVec3::ZERO,
+    distance_mm: f64::INFINITY,
 };
 
 impl<'a, B: Body> Surface<'a, B> {
-    /// Samples `body` finely enough that the nearest sample tells the nearest face: 1/300 of its diagonal.
+    /// Samples `body` finely enough that the nearest sample tells the nearest face: 1/200 of its diagonal.
     pub fn new(body: &'a B) -> Self {
         let [low, high] = body.bounds();
-        let spacing_mm = ((high - low).length() / 300.0).max(1e-9);
+        let spacing_mm = ((high - low).length() / 200.0).max(1e-9);
         let samples = body.samples(spacing_mm);
         let points: Vec<DVec3> = samples.iter().map(|s| s.point).collect();
         Self {
@@ -121,6 +124,7 @@ impl<'a, B: Body> Surface<'a, B> {
             face: sample.face,
             deviation_mm,
             normal: foot.normal,
+            distance_mm: distance,
         };
         distance.is_finite().then_some((distance, place))
     }

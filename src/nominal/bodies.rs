@@ -27,6 +27,8 @@ pub(super) const BODIES: [&str; 5] = [
     "SHELL_BASED_SURFACE_MODEL",
     "FACE_BASED_SURFACE_MODEL",
 ];
+/// Entity type of a wireframe: curves that bound no face.
+const WIREFRAME: &str = "GEOMETRIC_CURVE_SET";
 /// Places of bodies that one file may unfold into.
 const MAX_PLACES: usize = 100_000;
 /// Levels of an assembly.
@@ -46,11 +48,15 @@ struct Assembly<'a> {
     refused: Vec<Refused>,
 }
 
+/// Bodies and wireframes at their places, and what of the assembly could not be read.
+pub(super) struct Places {
+    pub bodies: Vec<Placed>,
+    pub wireframes: Vec<Placed>,
+    pub refused: Vec<Refused>,
+}
+
 /// Every body at every place it has; bodies that no representation holds stand where they are.
-pub(super) fn placed_bodies(
-    file: &Part21,
-    name: &str,
-) -> Result<(Vec<Placed>, Vec<Refused>), NominalError> {
+pub(super) fn placed_bodies(file: &Part21, name: &str) -> Result<Places, NominalError> {
     let mut assembly = Assembly {
         file,
         children: BTreeMap::new(),
@@ -104,7 +110,12 @@ pub(super) fn placed_bodies(
             unique.push(p);
         }
     }
-    Ok((unique, assembly.refused))
+    let (wireframes, bodies) = unique.into_iter().partition(|p| file.is(p.body, WIREFRAME));
+    Ok(Places {
+        bodies,
+        wireframes,
+        refused: assembly.refused,
+    })
 }
 
 fn same_place(a: &RigidTransform, b: &RigidTransform) -> bool {
@@ -326,7 +337,7 @@ impl Assembly<'_> {
             .items(representation)
             .unwrap_or_default()
             .into_iter()
-            .filter(|i| BODIES.iter().any(|b| self.file.is(*i, b)))
+            .filter(|i| self.file.is(*i, WIREFRAME) || BODIES.iter().any(|b| self.file.is(*i, b)))
             .collect();
         if !bodies.is_empty() {
             let units = self.units(representation);

@@ -4,14 +4,14 @@ use std::collections::BTreeMap;
 
 use glam::DVec3;
 
-use super::bodies::{BODIES, Placed, placed_bodies};
+use super::bodies::{BODIES, Placed, Places, placed_bodies};
 use super::face::Face;
 use super::part21::{Part21, Read, refuse};
 use super::path::Path;
-use super::shapes::Shapes;
+use super::shapes::{Shapes, edge_range};
 use super::sharp::{Joint, SharpEdge};
 use super::trim::{Trim, UvLoop};
-use super::{Edge, Nominal, NominalError, Refused};
+use super::{Edge, Nominal, NominalError, Refused, Wire};
 use crate::geometry::{Curve, Frame, RigidTransform, Surface};
 
 /// Faces that one nominal may have.
@@ -22,7 +22,11 @@ const CHORD: f64 = 8e-6;
 /// Reads a nominal from the text of a STEP file.
 pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
     let file = Part21::parse(bytes, name)?;
-    let (places, refused) = placed_bodies(&file, name)?;
+    let Places {
+        bodies: places,
+        wireframes,
+        refused,
+    } = placed_bodies(&file, name)?;
     if places.is_empty() {
         return Err(NominalError::NoShape {
             name: name.into(),
@@ -33,6 +37,7 @@ pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
         file: &file,
         faces: Vec::new(),
         edges: Vec::new(),
+        wires: Vec::new(),
         refused,
         refused_faces: 0,
     };
@@ -55,6 +60,9 @@ pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
             faces: b.refused_faces,
             first: b.refused.first().cloned().unwrap_or_else(none),
         });
+    }
+    for place in &wireframes {
+        b.wireframe(place);
     }
     Ok(b.finish(name, bodies))
 }
@@ -110,6 +118,7 @@ struct Builder<'a> {
     file: &'a Part21,
     faces: Vec<Face>,
     edges: Vec<BuiltEdge>,
+    wires: Vec<Wire>,
     refused: Vec<Refused>,
     refused_faces: usize,
 }
@@ -387,6 +396,33 @@ impl<'a> Builder<'a> {
         super::unroll::unroll(surface, &points)
     }
 
+    /// The curves of a GEOMETRIC_CURVE_SET; its points are passed over.
+    fn wireframe(&mut self, place: &Placed) {
+        let shapes = Shapes {
+            file: self.file,
+            units: place.units,
+        };
+        let items = self.file.record(place.body).and_then(|r| r.references(1));
+        for item in items.unwrap_or_default() {
+            if self.file.is(item, "CARTESIAN_POINT") {
+                continue;
+            }
+            match shapes.bounded_curves(item) {
+                Ok(pieces) => self.wires.extend(pieces.into_iter().map(|(curve, range)| {
+                    let curve = curve.transformed(&place.root_from_body);
+                    let length_mm = Path::new(curve.clone(), range).length_mm();
+                    Wire {
+                        entity: item,
+                        curve,
+                        range,
+                        length_mm,
+                    }
+                })),
+                Err(why) => self.refused.push(why),
+            }
+        }
+    }
+
     fn finish(self, name: &str, bodies: usize) -> Nominal {
         let mut sharp_edges = Vec::new();
         for e in &self.edges {
@@ -395,7 +431,14 @@ impl<'a> Builder<'a> {
         for (i, s) in sharp_edges.iter_mut().enumerate() {
             s.id = format!("e{}", i + 1);
         }
-        let bounding_box_mm = bounding_box(&self.faces, &self.edges);
+        let faces_box_mm = bounding_box(&self.faces, &self.edges);
+        let wires = self.wires.iter().flat_map(|w| {
+            let path = Path::new(w.curve.clone(), w.range);
+            path.polyline(CHORD * w.length_mm)
+        });
+        let bounding_box_mm = wires.fold(faces_box_mm, |[low, high], (_, p)| {
+            [low.min(p), high.max(p)]
+        });
         let edges = self.edges.into_iter().map(|e| {
             let mut faces: Vec<u32> = e.uses.iter().map(|u| u.face).collect();
             faces.sort_unstable();
@@ -415,7 +458,9 @@ impl<'a> Builder<'a> {
             faces: self.faces,
             sharp_edges,
             refused: self.refused,
+            wires: self.wires,
             bounding_box_mm,
+            faces_box_mm,
         }
     }
 }
@@ -439,47 +484,6 @@ fn densify(points: &[DVec3], surface: &Surface, path: &Path) -> Vec<DVec3> {
     dense[0] = points[0];
     dense[LEAST - 1] = points[points.len() - 1];
     dense
-}
-
-/// Parameters of start and end of an edge on its curve.
-fn edge_range(
-    curve: &Curve,
-    [start, end]: [DVec3; 2],
-    closed: bool,
-    forward: bool,
-) -> Result<(f64, f64), String> {
-    let range = curve.range();
-    let ((from, miss_from), (mut to, miss_to)) = (curve.nearest(start), curve.nearest(end));
-    let size = start.distance(end) + start.length() + 1.0;
-    let miss = miss_from.max(miss_to);
-    if miss > 1e-2 * size {
-        return Err(format!("its vertices lie {miss:.3e} mm beside its curve"));
-    }
-    let Some(period) = range.period() else {
-        if closed || from == to {
-            return Err(format!(
-                "it starts and ends at one point of an open {}",
-                curve.kind()
-            ));
-        }
-        return Ok((from, to));
-    };
-    if closed {
-        to = if forward {
-            from + period
-        } else {
-            from - period
-        };
-        return Ok((from, to));
-    }
-    // Two vertices at one place, on a closed curve: the whole turn.
-    let rounding = 1e-9 * period;
-    if forward && to <= from + rounding {
-        to += period;
-    } else if !forward && to >= from - rounding {
-        to -= period;
-    }
-    Ok((from, to))
 }
 
 /// The sharp stretches of an edge between two different faces.

@@ -293,6 +293,19 @@ impl<'a> Record<'a> {
             .ok_or_else(|| self.wrong(i, "a finite number"))
     }
 
+    /// The first reference in a list.
+    pub fn first_reference(&self, i: usize) -> Option<u64> {
+        self.list(i).ok()?.iter().find_map(|a| match a {
+            Attribute::EntityRef(id) => Some(*id),
+            _ => None,
+        })
+    }
+
+    /// The first number in a list.
+    pub fn first_number(&self, i: usize) -> Option<f64> {
+        self.list(i).ok()?.iter().find_map(number)
+    }
+
     /// A list of numbers.
     pub fn numbers(&self, i: usize) -> Read<Vec<f64>> {
         self.list(i)?

@@ -140,6 +140,64 @@ impl Shapes<'_> {
         }))
     }
 
+    /// A curve of a wireframe as bounded pieces.
+    pub fn bounded_curves(&self, id: u64) -> Read<Vec<(Curve, (f64, f64))>> {
+        match self.file.type_of(id).as_str() {
+            "COMPOSITE_CURVE" => {
+                let mut out = Vec::new();
+                for segment in self.file.record(id)?.references(1)? {
+                    let parent = self.file.record(segment)?.reference(2)?;
+                    if self.file.is(parent, "COMPOSITE_CURVE") {
+                        return Err(refuse(
+                            parent,
+                            "a composite curve inside another is not read",
+                        ));
+                    }
+                    out.extend(self.bounded_curves(parent)?);
+                }
+                Ok(out)
+            }
+            "TRIMMED_CURVE" => Ok(vec![self.trimmed(&self.file.record(id)?)?]),
+            _ => {
+                let curve = self.curve(id)?.shape;
+                let r = curve.range();
+                if !(r.to - r.from).is_finite() {
+                    return Err(refuse(
+                        id,
+                        format!("an unbounded {} in a wireframe", curve.kind()),
+                    ));
+                }
+                Ok(vec![(curve, (r.from, r.to))])
+            }
+        }
+    }
+
+    fn trimmed(&self, r: &Record<'_>) -> Read<(Curve, (f64, f64))> {
+        let basis = r.reference(1)?;
+        let curve = self.curve(basis)?;
+        let forward = r.flag(4)? ^ curve.reversed;
+        let end = |i: usize| -> Read<DVec3> {
+            if let Some(point) = r.first_reference(i) {
+                return self.file.point(point, self.units);
+            }
+            let value = r
+                .first_number(i)
+                .ok_or_else(|| refuse(r.id, "a trim without value"))?;
+            let factor = match &curve.shape {
+                Curve::Circle { .. } | Curve::Ellipse { .. } => self.units.angle_rad,
+                Curve::Line { .. } => {
+                    let vector = self.file.record(self.file.record(basis)?.reference(2)?)?;
+                    vector.number(2)? * self.units.length_mm
+                }
+                _ => 1.0,
+            };
+            Ok(curve.shape.point(value * factor))
+        };
+        let range = edge_range(&curve.shape, [end(2)?, end(3)?], false, forward)
+            .map_err(|reason| refuse(r.id, reason))?;
+        Ok((curve.shape, range))
+    }
+
     fn polyline(&self, r: &Record<'_>) -> Read<Curve> {
         let points = self.points(&r.references(1)?)?;
         let last = points.len().saturating_sub(1);
@@ -363,6 +421,47 @@ impl Shapes<'_> {
             half_angle_rad: angle.abs(),
         })
     }
+}
+
+/// Parameters of start and end of an edge on its curve.
+pub(super) fn edge_range(
+    curve: &Curve,
+    [start, end]: [DVec3; 2],
+    closed: bool,
+    forward: bool,
+) -> Result<(f64, f64), String> {
+    let range = curve.range();
+    let ((from, miss_from), (mut to, miss_to)) = (curve.nearest(start), curve.nearest(end));
+    let size = start.distance(end) + start.length() + 1.0;
+    let miss = miss_from.max(miss_to);
+    if miss > 1e-2 * size {
+        return Err(format!("its vertices lie {miss:.3e} mm beside its curve"));
+    }
+    let Some(period) = range.period() else {
+        if closed || from == to {
+            return Err(format!(
+                "it starts and ends at one point of an open {}",
+                curve.kind()
+            ));
+        }
+        return Ok((from, to));
+    };
+    if closed {
+        to = if forward {
+            from + period
+        } else {
+            from - period
+        };
+        return Ok((from, to));
+    }
+    // Two vertices at one place, on a closed curve: the whole turn.
+    let rounding = 1e-9 * period;
+    if forward && to <= from + rounding {
+        to += period;
+    } else if !forward && to >= from - rounding {
+        to -= period;
+    }
+    Ok((from, to))
 }
 
 /// Each knot as often as its multiplicity says.

@@ -4,6 +4,7 @@ use glam::DVec3;
 
 use super::path::Path;
 use super::{EdgeKind, Face, Foot, Nominal, Station};
+use crate::geometry::Curve;
 
 /// Smallest turn angle of a sharp edge, 5 degrees.
 ///
@@ -74,6 +75,16 @@ impl SharpEdge {
     /// The station at an arc length, clamped to the ends.
     pub fn station(&self, nominal: &Nominal, s_mm: f64) -> Station {
         self.station_near(nominal, s_mm, &mut [None; 2])
+    }
+
+    /// The whole curve under the edge.
+    pub fn curve(&self) -> &Curve {
+        self.path.curve()
+    }
+
+    /// Position at an arc length, clamped to the ends, mm.
+    pub fn point(&self, s_mm: f64) -> DVec3 {
+        self.path.at(s_mm).0
     }
 
     /// Arc length of the nearest place on the edge, and its distance, both mm.

@@ -237,7 +237,7 @@ fn edge_from_result(
                 stations.push(station);
             }
             None => findings.push(format!(
-                "edge {}: the nominal place of station {index} {NOT_FINITE}; the station is left out",
+                "edge {}: the nominal place of station {index} {UNUSABLE}; the station is left out",
                 edge.id
             )),
         }
@@ -295,7 +295,7 @@ fn evaluate(
     (summary, characteristics)
 }
 
-const NOT_FINITE: &str = "is not a number below 1e9";
+const UNUSABLE: &str = "is not a number below 1e9";
 
 /// `None` where the nominal place itself is not finite.
 fn station_from_result(result: &StationResult, kind: EdgeKind) -> Option<wire::Station> {
@@ -337,7 +337,7 @@ fn fill_measured(station: &mut wire::Station, measured: &crate::inspect::result:
     let point = xyz(measured.point);
     let [d1, d2] = measured.d_mm.map(finite);
     let (Some(_), Some(_), Some(_)) = (point, d1, d2) else {
-        lower(station, &format!("the measured edge {NOT_FINITE}"));
+        lower(station, &format!("the measured edge {UNUSABLE}"));
         return;
     };
     station.measured = point;
@@ -358,7 +358,7 @@ fn fill_measured(station: &mut wire::Station, measured: &crate::inspect::result:
     .into_iter()
     .filter(|(value, _)| value.is_none());
     for (_, name) in without {
-        lower(station, &format!("the {name} {NOT_FINITE}"));
+        lower(station, &format!("the {name} {UNUSABLE}"));
     }
 }
 

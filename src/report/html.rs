@@ -100,18 +100,28 @@ fn write_page(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt:
 /// The stations of `edge` that are drawn: all, or evenly thinned with the worst ones and the ends of holes kept.
 fn stations_shown(edge: &Edge, edges: usize) -> Vec<usize> {
     let budget = (STATIONS_DRAWN / edges.max(1)).max(12);
-    let every = edge.stations.len().div_ceil(budget).max(1);
+    let all = edge.stations.len();
+    if all <= budget {
+        return (0..all).collect();
+    }
+    let measured = |index: usize| edge.stations[index].measured.is_some();
+    let ends_of_holes: Vec<usize> = (1..all)
+        .filter(|&index| measured(index) != measured(index - 1))
+        .flat_map(|index| [index - 1, index])
+        .take(budget)
+        .collect();
     let worst = |s_mm: f64| edge.characteristics.iter().any(|c| c.s_mm == Some(s_mm));
-    let measured = |index: usize| edge.stations.get(index).map(|s| s.measured.is_some());
-    let all = edge.stations.len() <= budget;
-    (0..edge.stations.len())
+    let mut shown: Vec<usize> = (0..all)
         .filter(|&index| {
-            all || index % every == 0
-                || index + 1 == edge.stations.len()
+            index % all.div_ceil(budget) == 0
+                || index + 1 == all
                 || worst(edge.stations[index].s_mm)
-                || (every < budget && measured(index) != measured(index + 1))
         })
-        .collect()
+        .chain(ends_of_holes)
+        .collect();
+    shown.sort_unstable();
+    shown.dedup();
+    shown
 }
 
 fn write_header(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt::Result {

@@ -4,8 +4,9 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::flank::Nearest;
+use super::lines;
 use super::robust::robust_normal;
-use super::{Place, Scale, Scratch, Settings, Surface, SurfaceError};
+use super::{LINE_SPACING, Meetings, Place, Scale, Scratch, Settings, Surface, SurfaceError};
 use crate::points::{Neighbors, PointCloud};
 
 /// Points whose results are held at once, before they go to their places.
@@ -123,13 +124,13 @@ pub fn reconstruct(
         normals
     };
     features.sharp.sort_unstable_by_key(|s| s.index);
-    let line_spacing_mm = 0.4 * surface.scale.spacing_mm;
+    let line_spacing_mm = LINE_SPACING * surface.scale.spacing_mm;
     Ok(Reconstruction {
         positions,
         normals,
         projected,
         sharp: features.sharp,
-        lines: super::resample::thin_lines(features.lines, line_spacing_mm),
+        lines: lines::agree(features.lines, line_spacing_mm),
         line_spacing_mm,
         scale: surface.scale,
     })
@@ -284,7 +285,7 @@ fn land_one(
     p: DVec3,
     try_smooth: bool,
     scratch: &mut Scratch,
-) -> (Option<Nearest>, [Option<Nearest>; 2]) {
+) -> (Option<Nearest>, Meetings) {
     let outcome = if try_smooth {
         surface.outcome(p, scratch)
     } else {
@@ -292,7 +293,7 @@ fn land_one(
         surface.sharp_outcome(scratch)
     };
     let Some(outcome) = outcome else {
-        return (None, [None; 2]);
+        return (None, Meetings::default());
     };
     let longest = surface.longest_way_mm();
     // Lines are sampled from as far as the flanks' own points reach beyond doubt.
@@ -306,7 +307,7 @@ fn land_one(
         if nearest.is_some() {
             meetings
         } else {
-            [None; 2]
+            Meetings::default()
         },
     )
 }

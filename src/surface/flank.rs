@@ -28,7 +28,6 @@ pub(crate) struct Neighborhood {
 #[derive(Debug, Clone)]
 pub(crate) struct Flank {
     pub local: LocalSurface,
-    pub count: usize,
 }
 
 /// Where the query's nearest point lies on the trimmed flanks.
@@ -37,14 +36,6 @@ pub(crate) struct Nearest {
     pub position: DVec3,
     /// Flanks it lies on, and their unit normals there.
     pub flanks: [usize; 3],
-    pub normals: [DVec3; 3],
-    pub sheets: usize,
-}
-
-/// A place on an edge or corner, as seen from one query.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Meeting {
-    pub position: DVec3,
     pub normals: [DVec3; 3],
     pub sheets: usize,
 }
@@ -166,11 +157,10 @@ impl Neighborhood {
             flank = Some((local.clone(), last));
         }
         let (local, last) = flank?;
-        let count = last.len();
         for i in last {
             self.labels[i] = label;
         }
-        Some(Flank { local, count })
+        Some(Flank { local })
     }
 
     /// Whether neighbour `i`'s own normal speaks for the surface, or says nothing.
@@ -221,10 +211,7 @@ impl Neighborhood {
                 continue;
             }
             if let Some(local) = self.fit_members(&old, (scale, smoothing)) {
-                kept.push(Flank {
-                    local,
-                    count: self.members.len(),
-                });
+                kept.push(Flank { local });
             }
         }
         kept
@@ -424,25 +411,36 @@ impl<'a> Arrangement<'a> {
                 if self.sides[a][b] == 0.0 {
                     continue;
                 }
-                let Some((x, na, nb)) = self.meet_two(a, b) else {
+                let Some(met) = self.meeting([a, b], DVec3::ZERO) else {
                     continue;
                 };
-                if best.is_some_and(|e| e.position.length() <= x.length())
-                    || !self.present(a, x)
-                    || !self.present(b, x)
-                    || !self.inside(x, &[a, b])
-                {
-                    continue;
+                if best.is_none_or(|e| e.position.length() > met.position.length()) {
+                    best = Some(met);
                 }
-                best = Some(Nearest {
-                    position: x,
-                    flanks: [a, b, b],
-                    normals: [na, nb, nb],
-                    sheets: 2,
-                });
             }
         }
         best
+    }
+
+    /// The place nearest to `start` where two flanks meet, if it lies on the parts of them that are there.
+    fn meeting(&self, [a, b]: [usize; 2], start: DVec3) -> Option<Nearest> {
+        let (x, na, nb) = self.meet_two([a, b], start)?;
+        let there = self.present(a, x) && self.present(b, x) && self.inside(x, &[a, b]);
+        there.then_some(Nearest {
+            position: x,
+            flanks: [a, b, b],
+            normals: [na, nb, nb],
+            sheets: 2,
+        })
+    }
+
+    /// The place on the same feature line as `edge`, `step_mm` along it.
+    pub fn along(&self, edge: &Nearest, step_mm: f64) -> Option<Nearest> {
+        let tangent = edge.normals[0].cross(edge.normals[1]).normalize_or_zero();
+        self.meeting(
+            [edge.flanks[0], edge.flanks[1]],
+            edge.position + tangent * step_mm,
+        )
     }
 
     /// The nearest place where three flanks meet, of which at least two pairs trim each other.
@@ -479,9 +477,9 @@ impl<'a> Arrangement<'a> {
         best
     }
 
-    /// The point of the intersection curve of two flanks nearest to the query, with both normals.
-    fn meet_two(&self, a: usize, b: usize) -> Option<(DVec3, DVec3, DVec3)> {
-        let mut x = DVec3::ZERO;
+    /// The point of the intersection curve of two flanks nearest to `start`, with both normals.
+    fn meet_two(&self, [a, b]: [usize; 2], start: DVec3) -> Option<(DVec3, DVec3, DVec3)> {
+        let mut x = start;
         let mut normals = (DVec3::Z, DVec3::Z);
         for _ in 0..6 {
             let fa = self.flanks[a].local.foot(x, self.reach_mm)?;
@@ -493,8 +491,9 @@ impl<'a> Arrangement<'a> {
             if sine_squared < 0.0027 {
                 return None;
             }
-            let (ca, cb) = (na.dot(fa.position), nb.dot(fb.position));
-            let next = na * ((ca - g * cb) / sine_squared) + nb * ((cb - g * ca) / sine_squared);
+            let (ca, cb) = (na.dot(fa.position - start), nb.dot(fb.position - start));
+            let next =
+                start + na * ((ca - g * cb) / sine_squared) + nb * ((cb - g * ca) / sine_squared);
             normals = (na, nb);
             let moved = next.distance(x);
             x = next;
@@ -533,15 +532,5 @@ impl<'a> Arrangement<'a> {
             }
         }
         Some((x, normals))
-    }
-}
-
-impl From<Nearest> for Meeting {
-    fn from(n: Nearest) -> Self {
-        Self {
-            position: n.position,
-            normals: n.normals,
-            sheets: n.sheets,
-        }
     }
 }

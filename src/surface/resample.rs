@@ -1,19 +1,18 @@
 //! New points spread evenly over the surface, and along its feature lines.
 
-use std::collections::HashMap;
-
-use glam::{DVec3, I64Vec3, Vec3};
+use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use super::bulk::{LinePoint, Reconstruction, reconstruct};
-use super::{Place, Settings, Surface, SurfaceError};
+use super::bulk::{Reconstruction, reconstruct};
+use super::lines::Grid;
+use super::{Place, Scale, Settings, Surface, SurfaceError};
 use crate::points::{Neighbors, PointCloud};
 
 /// More new points than this are not made.
 const MOST_POINTS: u64 = 200_000_000;
 
 /// An even set of points on a surface.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone)]
 pub struct Resampled {
     /// M positions, mm.
     pub positions: Vec<DVec3>,
@@ -21,51 +20,8 @@ pub struct Resampled {
     pub normals: Vec<Vec3>,
     /// What each point lies on.
     pub places: Vec<Place>,
-}
-
-/// Points in cells of their own size, to ask whether one is near.
-struct Grid {
-    cell_mm: f64,
-    cells: HashMap<I64Vec3, Vec<DVec3>>,
-}
-
-impl Grid {
-    fn new(cell_mm: f64) -> Self {
-        Self {
-            cell_mm,
-            cells: HashMap::new(),
-        }
-    }
-
-    /// Adds `p` unless a point nearer than `distance_mm` (at most the cell) is there.
-    fn take(&mut self, p: DVec3, distance_mm: f64) -> bool {
-        let home = (p / self.cell_mm).floor().as_i64vec3();
-        let squared = distance_mm * distance_mm;
-        for x in -1..=1 {
-            for y in -1..=1 {
-                for z in -1..=1 {
-                    let cell = self.cells.get(&(home + I64Vec3::new(x, y, z)));
-                    if cell.is_some_and(|c| c.iter().any(|q| q.distance_squared(p) < squared)) {
-                        return false;
-                    }
-                }
-            }
-        }
-        self.cells.entry(home).or_default().push(p);
-        true
-    }
-}
-
-/// Samples no two of which are nearer than `spacing_mm`; corners go first.
-pub(super) fn thin_lines(lines: Vec<LinePoint>, spacing_mm: f64) -> Vec<LinePoint> {
-    let mut grid = Grid::new(spacing_mm.max(f64::MIN_POSITIVE));
-    let (corners, edges): (Vec<_>, Vec<_>) =
-        lines.into_iter().partition(|l| l.place == Place::Corner);
-    corners
-        .into_iter()
-        .chain(edges)
-        .filter(|l| grid.take(l.position, spacing_mm))
-        .collect()
+    /// The sizes that followed from the cloud.
+    pub scale: Scale,
 }
 
 /// Spreads points over the surface through `cloud`: on faces no two nearer than about `spacing_mm` and none missing, and along feature lines
@@ -91,7 +47,12 @@ pub fn resample(
     }
     let first = reconstruct(cloud, neighbors, settings)?;
     let mut grid = Grid::new(spacing_mm);
-    let mut out = Resampled::default();
+    let mut out = Resampled {
+        positions: Vec::new(),
+        normals: Vec::new(),
+        places: Vec::new(),
+        scale: surface.scale,
+    };
     add_lines(&first, spacing_mm, (&mut grid, &mut out));
     // Two points of one face are apart by this; it leaves a spacing of about what was asked for on average.
     let apart = 0.8 * spacing_mm;
@@ -112,7 +73,11 @@ impl Resampled {
     }
 }
 
-fn add_lines(first: &Reconstruction, spacing_mm: f64, (grid, out): (&mut Grid, &mut Resampled)) {
+fn add_lines(
+    first: &Reconstruction,
+    spacing_mm: f64,
+    (grid, out): (&mut Grid<()>, &mut Resampled),
+) {
     for line in &first.lines {
         if grid.take(line.position, 0.4 * spacing_mm) {
             out.push(line.position, line.normals[0], line.place);
@@ -121,7 +86,7 @@ fn add_lines(first: &Reconstruction, spacing_mm: f64, (grid, out): (&mut Grid, &
 }
 
 /// Grows the set outwards from its own points until none has room beside it.
-fn fill(surface: &Surface, apart: f64, (grid, out): (&mut Grid, &mut Resampled)) {
+fn fill(surface: &Surface, apart: f64, (grid, out): (&mut Grid<()>, &mut Resampled)) {
     let mut from = 0;
     while from < out.positions.len() && (out.positions.len() as u64) < MOST_POINTS {
         let until = out.positions.len().min(from + 65_536);

@@ -47,6 +47,11 @@ impl Scale {
         }
     }
 
+    /// h of the Gaussian weight exp(-d²/h²) where points lie evenly, mm.
+    pub fn smoothing_mm(&self) -> f64 {
+        self.spacing_mm * (self.points as f64 / std::f64::consts::PI).sqrt() / 1.5
+    }
+
     /// Below this two lengths on the surface are the same, mm, even without any noise.
     pub(crate) fn floor_mm(&self) -> f64 {
         0.004 * self.spacing_mm

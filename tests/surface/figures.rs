@@ -73,20 +73,24 @@ pub fn cube_trial(n: usize, percent: f64) -> Trial {
 
 /// The stepped block, `count` random points, Gaussian noise of 0.1 spacings in every direction.
 pub fn block_trial(count: usize) -> Trial {
+    body_trial("machined block", stepped_block(), count, 0.1)
+}
+
+/// `count` random points of a body, Gaussian noise of `ratio` spacings in every direction.
+pub fn body_trial(name: &str, body: Body, count: usize, ratio: f64) -> Trial {
     let mut dice = Dice(11);
-    let body = stepped_block();
     let unit_mm = (body.area() / count as f64).sqrt();
     let seen = body
         .points(count, &mut dice)
         .into_iter()
         .map(|(clean, face)| Seen {
-            noisy: clean + dice.cloud() * (0.1 * unit_mm),
+            noisy: clean + dice.cloud() * (ratio * unit_mm),
             clean,
             face,
         })
         .collect();
     Trial {
-        name: format!("machined block, {count}"),
+        name: format!("{name}, {count}"),
         body,
         seen,
         unit_mm,

@@ -480,3 +480,48 @@ pub fn stepped_block() -> Body {
     }
     Body { faces, edges }
 }
+
+/// Two square plates of side 20 that meet along the y axis at an included angle.
+pub fn ridge(included_deg: f64) -> Body {
+    let half = (included_deg / 2.0).to_radians();
+    let y = DVec3::Y * 20.0;
+    let down = |sign: f64| DVec3::new(sign * half.sin(), 0.0, -half.cos()) * 20.0;
+    Body {
+        faces: vec![
+            Face::rectangle(DVec3::ZERO, y, down(1.0), &[]),
+            Face::rectangle(DVec3::ZERO, y, down(-1.0), &[]),
+        ],
+        edges: vec![Edge::Segment(DVec3::ZERO, y)],
+    }
+}
+
+/// Two parallel square plates of side 20, `gap` apart; no edge.
+pub fn plates(gap: f64) -> Body {
+    let (x, y) = (DVec3::X * 20.0, DVec3::Y * 20.0);
+    Body {
+        faces: vec![
+            Face::rectangle(DVec3::ZERO, x, y, &[]),
+            Face::rectangle(DVec3::Z * gap, x, y, &[]),
+        ],
+        edges: vec![Edge::Segment(DVec3::splat(1e6), DVec3::splat(1e6 + 1.0))],
+    }
+}
+
+/// A slot of the given width and depth in a plate of side 20, closed at its ends by nothing.
+pub fn slot(width: f64, depth: f64) -> Body {
+    let y = DVec3::Y * 20.0;
+    let v = |x: f64, z: f64| DVec3::new(x, 0.0, z);
+    let w = 0.5 * width;
+    Body {
+        faces: vec![
+            Face::rectangle(v(-10.0, 0.0), DVec3::X * (10.0 - w), y, &[]),
+            Face::rectangle(v(w, 0.0), DVec3::X * (10.0 - w), y, &[]),
+            Face::rectangle(v(-w, -depth), DVec3::X * width, y, &[]),
+            Face::rectangle(v(-w, -depth), DVec3::Z * depth, y, &[]),
+            Face::rectangle(v(w, -depth), DVec3::Z * depth, y, &[]),
+        ],
+        edges: [(-w, 0.0), (w, 0.0), (-w, -depth), (w, -depth)]
+            .map(|(x, z)| Edge::Segment(v(x, z), v(x, z) + y))
+            .into(),
+    }
+}

@@ -263,6 +263,7 @@ pub fn error_remedy(code: u32) -> &'static str {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use proptest::test_runner::RngSeed;
 
     use super::*;
 
@@ -408,6 +409,12 @@ mod tests {
     }
 
     proptest! {
+        #![proptest_config(ProptestConfig {
+            rng_seed: RngSeed::Fixed(7),
+            failure_persistence: None,
+            ..ProptestConfig::default()
+        })]
+
         #[test]
         fn results_survive_the_round_trip(
             position in prop::array::uniform3(-9_999_999_i32..=9_999_999),

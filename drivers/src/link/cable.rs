@@ -101,7 +101,7 @@ impl Serial {
             .stop_bits(line.stop_bits)
             .dtr_on_open(true)
             .open_native()
-            .map_err(|error| open_error(&error, path, line))?;
+            .map_err(|error| open_error(&error, path))?;
         let reader = writer.try_clone_native().map_err(|error| LinkError::Io {
             action: "opening the port a second time",
             source: error.into(),
@@ -114,7 +114,7 @@ impl Serial {
 }
 
 /// What the failure to open a port means. `NoDevice` is how the serialport crate reports both kinds of lock on Linux.
-fn open_error(error: &serialport::Error, path: &str, line: Line) -> LinkError {
+fn open_error(error: &serialport::Error, path: &str) -> LinkError {
     use serialport::ErrorKind as Kind;
     match error.kind() {
         Kind::NoDevice => LinkError::Busy,
@@ -123,7 +123,6 @@ fn open_error(error: &serialport::Error, path: &str, line: Line) -> LinkError {
             group: owning_group(path),
         },
         _ if !is_character_device(path) => LinkError::NotSerial,
-        Kind::InvalidInput => LinkError::LineRefused { baud: line.baud },
         _ => LinkError::Io {
             action: "opening the port",
             source: io::Error::other(error.to_string()),
@@ -322,5 +321,100 @@ impl Link for Tcp {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use serialport::UsbPortInfo;
+
+    use super::*;
+
+    fn usb(path: &str, vendor: u16, serial: Option<&str>) -> SerialPortInfo {
+        SerialPortInfo {
+            port_name: path.into(),
+            port_type: SerialPortType::UsbPort(UsbPortInfo {
+                vid: vendor,
+                pid: 0x6001,
+                serial_number: serial.map(str::to_owned),
+                manufacturer: None,
+                product: None,
+            }),
+        }
+    }
+
+    #[test]
+    fn a_port_is_found_by_its_usb_name_wherever_it_was_plugged_in() {
+        let ports = [
+            usb("/dev/ttyUSB2", 0x0403, Some("P-42")),
+            usb("/dev/ttyUSB1", 0x0403, None),
+            usb("/dev/ttyACM0", 0x0483, Some("P-43")),
+            SerialPortInfo {
+                port_name: "/dev/ttyS0".into(),
+                port_type: SerialPortType::Unknown,
+            },
+        ];
+        let find = |port: Port| match pick(&ports, &port) {
+            Ok(path) => path,
+            Err(error) => error.to_string(),
+        };
+        let id = |vendor| Port::UsbId {
+            vendor,
+            product: 0x6001,
+        };
+        assert_eq!(find(Port::UsbSerial("P-42".into())), "/dev/ttyUSB2");
+        assert_eq!(find(id(0x0483)), "/dev/ttyACM0");
+        assert_eq!(find(Port::Path("/dev/ttyS0".into())), "/dev/ttyS0");
+        assert_eq!(
+            find(id(0x0403)),
+            "it may be any of [\"/dev/ttyUSB1\", \"/dev/ttyUSB2\"]; name one of these by `port`"
+        );
+        assert_eq!(
+            find(Port::UsbSerial("P-44".into())),
+            "nothing of this name is there; check cable, power and the name"
+        );
+    }
+
+    #[test]
+    fn failures_to_open_are_told_apart() {
+        let told = |kind, path: &str| {
+            open_error(&serialport::Error::new(kind, "reason"), path).to_string()
+        };
+        use serialport::ErrorKind as Kind;
+        let denied = Kind::Io(ErrorKind::PermissionDenied);
+        assert_eq!(
+            told(denied, "/no/such/path"),
+            "this user may not open it; add the user to the group \"dialout\" (usermod -aG dialout USER) and log in again"
+        );
+        // The first user of every system owns its null device.
+        assert!(told(denied, "/dev/null").contains("the group \"root\""));
+        assert_eq!(told(Kind::Unknown, "/dev/null"), "opening the port failed");
+        assert_eq!(
+            told(Kind::Unknown, "/"),
+            "it is not a serial port; give the path of one, as in \"/dev/ttyACM0\""
+        );
+    }
+
+    #[test]
+    fn failures_to_connect_are_told_apart() {
+        let told = |kind: ErrorKind| connect_error(kind.into()).to_string();
+        assert_eq!(
+            told(ErrorKind::TimedOut),
+            "no connection within 2 s; check cable, power and the address"
+        );
+        assert_eq!(told(ErrorKind::HostUnreachable), told(ErrorKind::TimedOut));
+        assert_eq!(told(ErrorKind::InvalidInput), "connecting failed");
+    }
+
+    #[test]
+    fn a_peer_that_keep_alive_gave_up_is_gone_and_a_wait_that_ended_is_not() {
+        let given_up = io::Error::from_raw_os_error(TIMED_OUT);
+        assert!(matches!(
+            tcp_failure(given_up, "reading"),
+            Some(LinkError::Gone)
+        ));
+        for waited in [ErrorKind::WouldBlock, ErrorKind::TimedOut] {
+            assert!(tcp_failure(waited.into(), "reading").is_none());
+        }
     }
 }

@@ -411,3 +411,106 @@ impl Line<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Counts what is written; nothing ever comes.
+    #[derive(Default)]
+    struct Quiet {
+        written: Mutex<u32>,
+    }
+
+    impl Link for Quiet {
+        fn read(&self, _: &mut [u8], _: Instant) -> Result<usize, LinkError> {
+            Ok(0)
+        }
+
+        fn write(&self, _: &[u8], _: Instant) -> Result<(), LinkError> {
+            *self.written.lock().unwrap_or_else(PoisonError::into_inner) += 1;
+            Ok(())
+        }
+    }
+
+    /// Lets a keep-alive fall due `times` times; the answer is how often one was written.
+    fn keepalives(shared: &Shared, times: u32) -> u32 {
+        let quiet = Arc::new(Quiet::default());
+        let link: Arc<dyn Link> = Arc::clone(&quiet) as _;
+        let mut line = Line {
+            link: &link,
+            decoder: Decoder::default(),
+            chunk: vec![0; 64],
+            keepalives: 0,
+            started: Instant::now(),
+        };
+        for _ in 0..times {
+            if let Some(run) = &mut shared.lock().run {
+                run.next_keepalive = Instant::now();
+            }
+            line.keep_alive(shared);
+        }
+        let written = quiet.written.lock();
+        *written.unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn running() -> Shared {
+        let shared = Shared::new();
+        shared.lock().begin(1, Duration::from_millis(500));
+        shared
+    }
+
+    #[test]
+    fn a_caller_that_stays_away_ends_the_keepalives() {
+        let shared = running();
+        assert_eq!(keepalives(&shared, 2), 2);
+        let long_ago = Instant::now().checked_sub(PATIENCE);
+        shared.lock().asked = long_ago.expect("a clock that began before");
+        assert_eq!(keepalives(&shared, 2), 0);
+        shared.lock().waiting = true;
+        assert_eq!(keepalives(&shared, 2), 2, "inside `next` it is there");
+    }
+
+    #[test]
+    fn keepalives_without_an_answer_end_as_silence() {
+        let shared = running();
+        assert_eq!(keepalives(&shared, UNANSWERED), UNANSWERED);
+        assert!(shared.lock().over.is_none());
+        assert_eq!(keepalives(&shared, 1), 0);
+        let error = shared.lock().over.as_mut().map(|over| over.error("p"));
+        assert_eq!(
+            error.map(|error| error.to_string()).as_deref(),
+            Some("p: no answer within 1.5 s; check power and cable, then retry")
+        );
+    }
+
+    #[test]
+    fn a_run_that_is_stopped_needs_no_keepalives() {
+        let shared = running();
+        shared.lock().note_stopped(Stopped {
+            reason: 3,
+            run: 1,
+            sent: 0,
+            dropped: 0,
+        });
+        assert_eq!(keepalives(&shared, 2), 0);
+        let shared = Shared::new();
+        assert_eq!(keepalives(&shared, 2), 0, "no run at all");
+    }
+
+    #[test]
+    fn sequence_numbers_may_wrap() {
+        let mut inbox = running();
+        let inbox = inbox.inbox.get_mut().expect("no panic before");
+        if let Some(run) = &mut inbox.run {
+            run.expected = u32::MAX;
+        }
+        inbox.note_stopped(Stopped {
+            reason: 0,
+            run: 1,
+            sent: 1,
+            dropped: 0,
+        });
+        assert_eq!(inbox.losses.lost_on_link, 2);
+    }
+}

@@ -445,6 +445,21 @@ fn a_slow_way_and_no_retraction() {
 }
 
 #[test]
+fn a_safe_height_is_gone_over() {
+    let model = Model {
+        work_offset: [1.0, 2.0, 3.0],
+        ..Model::default()
+    };
+    let (fake, mut probe) = open(model, &format!("{TABLE}\nsafe_z_mm = 40"));
+    touch(&mut probe).expect("a touch");
+    let heard = &fake.lock().device.heard;
+    assert_eq!(
+        heard[heard.len() - 5..heard.len() - 2],
+        ["G0 Z37.0000", "G0 X9.0000 Y18.0000", "G0 Z-8.0000"]
+    );
+}
+
+#[test]
 fn retraction_ends_at_the_start() {
     let (fake, mut probe) = open(Model::default(), &format!("{TABLE}\nretract_mm = 50"));
     touch(&mut probe).expect("a touch");
@@ -498,7 +513,7 @@ fn all_mistakes_of_a_table_are_told_at_once() {
             "limits_max_mm: [1.0, 1.0, 0.0], expected more than limits_min_mm on every axis",
             "unlock_on_open: \"no\", expected true or false",
             "feed: an unknown key, expected one of baud, port, usb_serial, usb_id, address, build_info, feed_mm_min, \
-             rapid, retract_mm, limits_min_mm, limits_max_mm, unlock_on_open",
+             rapid, safe_z_mm, retract_mm, limits_min_mm, limits_max_mm, unlock_on_open",
         ]
     );
     assert_eq!(

@@ -38,8 +38,10 @@ struct Model {
     dropped: u32,
     /// Profiles that come between STOP and STOPPED.
     queued: u32,
-    /// Answers STOP with HELLO's reply and so on: REFUSED for this type.
+    /// Answers this type by REFUSED.
     refuses: Option<u8>,
+    /// Answers HELLO by STOPPED.
+    confused: bool,
 }
 
 fn frame(kind: u8, id: u32, payload: &[u8]) -> Vec<u8> {
@@ -137,6 +139,7 @@ impl Device for Model {
             return frame(0x9F, id, b"\x08\x00\x04\x00oops");
         }
         match kind {
+            1 if self.confused => stopped(id, 0, 0, 0, 0),
             1 => frame(0x81, id, &self.identity()),
             2 => {
                 let asked = i64::from_le_bytes(payload[2..10].try_into().expect("8 bytes"));
@@ -313,6 +316,18 @@ fn a_refused_command_says_why() {
 }
 
 #[test]
+fn an_answer_to_another_question_is_told() {
+    let model = Model {
+        confused: true,
+        ..Model::default()
+    };
+    assert_eq!(
+        refused(model, TABLE),
+        "/dev/fake: bad data from the device: HELLO was answered by a message of another kind"
+    );
+}
+
+#[test]
 fn an_open_interlock_keeps_the_laser_off() {
     let fake = Scripted::new(Model {
         start_status: 7,
@@ -445,6 +460,24 @@ fn profiles_missing_at_the_end_are_found_by_stopped() {
     assert_eq!(rest.len(), 1);
     assert_eq!(profiler.losses().lost_on_link, 4);
     assert_eq!(profiler.stop().expect("a second stop"), []);
+}
+
+#[test]
+fn a_stop_that_is_not_confirmed_leaves_the_profiles_to_next() {
+    let (fake, mut profiler, run) = running(Model::default());
+    fake.lock().device.mute = true;
+    for sequence in 0..2 {
+        fake.send(&profile(sequence, run, BOOT, 4));
+    }
+    let error = profiler.stop().expect_err("silence");
+    assert!(
+        text(&error).contains("no answer within"),
+        "{}",
+        text(&error)
+    );
+    assert_eq!(next(&mut profiler).expect("a profile"), 0);
+    assert_eq!(next(&mut profiler).expect("a profile"), 1);
+    assert!(next(&mut profiler).is_err());
 }
 
 #[test]

@@ -23,10 +23,11 @@ const HAIR_SHARE: f64 = 0.06;
 
 /// The drawing of one report, ready to be written in either form.
 pub struct Drawing<'a> {
-    report: &'a Report,
     lines: Vec<Line<'a>>,
     centre: DVec3,
     radius_mm: f64,
+    /// Edges that the nominal does not have, thinned.
+    extra: Vec<Vec<DVec3>>,
     /// How much larger the deviations are drawn than the part.
     pub factor: f64,
 }
@@ -68,7 +69,7 @@ impl<'a> Drawing<'a> {
             .map(DVec3::length)
             .fold(0.0, f64::max);
         Drawing {
-            report,
+            extra: thinned(&report.unexpected_edges),
             factor: factor(2.0 * radius_mm, largest),
             lines,
             centre,
@@ -99,9 +100,9 @@ impl<'a> Drawing<'a> {
                 out.write_str("\"/>\n")?;
             }
         }
-        for extra in &self.report.unexpected_edges {
+        for extra in &self.extra {
             out.write_str(r#"<path class="extra" d=""#)?;
-            write_path(out, extra.iter().map(|p| at(DVec3::from(*p))))?;
+            write_path(out, extra.iter().map(|p| at(*p)))?;
             out.write_str("\"/>\n")?;
         }
         for line in &order {
@@ -186,9 +187,30 @@ impl<'a> Drawing<'a> {
             "yaw": YAW_RAD, "pitch": PITCH_RAD,
             "centre": self.centre.to_array(), "radius": self.radius_mm,
             "factor": self.factor, "factors": sorted(factors), "edges": edges,
-            "unexpected": self.report.unexpected_edges,
+            "unexpected": self.extra.iter()
+                .map(|line| line.iter().map(|p| text(*p, 1e-3)).collect())
+                .collect::<Vec<Vec<_>>>(),
         })
     }
+}
+
+/// Evenly fewer points where there are more than a page can carry; the ends stay.
+fn thinned(lines: &[Vec<Xyz>]) -> Vec<Vec<DVec3>> {
+    const POINTS_DRAWN: usize = 4000;
+    let every = lines
+        .iter()
+        .map(Vec::len)
+        .sum::<usize>()
+        .div_ceil(POINTS_DRAWN)
+        .max(1);
+    let keep = |line: &Vec<Xyz>| {
+        let last = line.len().saturating_sub(1);
+        let kept = line.iter().enumerate();
+        kept.filter(|(index, _)| index % every == 0 || *index == last)
+            .map(|(_, p)| DVec3::from(*p))
+            .collect()
+    };
+    lines.iter().take(POINTS_DRAWN).map(keep).collect()
 }
 
 fn sorted(mut values: Vec<f64>) -> Vec<f64> {

@@ -7,6 +7,17 @@ use super::percent;
 use crate::report::figure::{COVERAGE_FACTOR, Figure};
 use crate::report::wire::{Alignment, Losses, Quantity, Recipe, Report, Rule};
 
+/// Items of a list that a page shows; more are read by nobody.
+const LISTED: usize = 40;
+
+/// Says how many items of a list are not shown.
+fn write_more(out: &mut String, items: usize) -> fmt::Result {
+    match items.saturating_sub(LISTED) {
+        0 => Ok(()),
+        more => write!(out, "<li>and {more} more, in the JSON form</li>"),
+    }
+}
+
 /// Writes everything that stands below the edges.
 pub fn write(out: &mut String, report: &Report) -> fmt::Result {
     write_unmatched(out, report)?;
@@ -42,7 +53,7 @@ fn write_unmatched(out: &mut String, report: &Report) -> fmt::Result {
             Escaped(id)
         )?;
     }
-    for line in &report.unexpected_edges {
+    for line in report.unexpected_edges.iter().take(LISTED) {
         if let (Some(a), Some(b)) = (line.first(), line.last()) {
             write!(
                 out,
@@ -51,6 +62,7 @@ fn write_unmatched(out: &mut String, report: &Report) -> fmt::Result {
             )?;
         }
     }
+    write_more(out, report.unexpected_edges.len())?;
     out.write_str("</ul></section>\n")
 }
 
@@ -262,9 +274,10 @@ fn write_list(out: &mut String, title: &str, items: &[String], none: &str) -> fm
         return writeln!(out, "<p>{}</p>", Escaped(none));
     }
     out.write_str("<ul>")?;
-    for item in items {
+    for item in items.iter().take(LISTED) {
         write!(out, "<li>{}</li>", Escaped(item))?;
     }
+    write_more(out, items.len())?;
     out.write_str("</ul>\n")
 }
 
@@ -273,7 +286,7 @@ fn grouped(count: u64) -> String {
     let digits = count.to_string();
     let mut text = String::with_capacity(digits.len() * 2);
     for (index, digit) in digits.chars().enumerate() {
-        if index > 0 && (digits.len() - index) % 3 == 0 {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
             text.push('\u{202f}');
         }
         text.push(digit);

@@ -244,7 +244,7 @@ fn write_holes(out: &mut String, axes: &Axes, dots: &[Dot]) -> fmt::Result {
                     out,
                     r#"<text class="x worst-name" x="{:.1}" y="{:.1}">not measured</text>"#,
                     (x0 + x1) / 2.0,
-                    HEIGHT - BOTTOM - 8.0
+                    TOP + 0.72 * (HEIGHT - TOP - BOTTOM)
                 )?;
             }
         }
