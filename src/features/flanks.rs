@@ -262,17 +262,9 @@ impl Workshop {
     fn split(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<([Fit; 2], Fit)> {
         let mut parts = [one.1, other.1];
         let either = |i: usize| self.labels[i] == one.0 || self.labels[i] == other.0;
-        let mut facing = [0.0; 2];
-        for (i, p) in self.points.iter().enumerate() {
-            if self.labels[i] == one.0 {
-                facing[0] += parts[1].surface.distance(*p);
-            } else if self.labels[i] == other.0 {
-                facing[1] += parts[0].surface.distance(*p);
-            }
-        }
-        let facing = facing.map(f64::signum);
         for _ in 0..2 {
             let [a, b] = [parts[0].surface, parts[1].surface];
+            let facing = self.facing([one.0, other.0], &[a, b]);
             let second = |i: usize| {
                 let p = self.points[i];
                 facing[0] * b.distance(p) < facing[1] * a.distance(p)
@@ -284,6 +276,19 @@ impl Workshop {
         }
         let whole = fit(&self.points, variance, either)?;
         Some((parts, whole))
+    }
+
+    /// On which side of the other surface each one's points lie: their signs.
+    fn facing(&self, labels: [u8; 2], surfaces: &[Surface; 2]) -> [f64; 2] {
+        let mut sums = [0.0; 2];
+        for (p, label) in self.points.iter().zip(&self.labels) {
+            if *label == labels[0] {
+                sums[0] += surfaces[1].distance(*p);
+            } else if *label == labels[1] {
+                sums[1] += surfaces[0].distance(*p);
+            }
+        }
+        sums.map(f64::signum)
     }
 
     /// The nearest decisive crease between two of the surfaces.
@@ -383,7 +388,7 @@ impl Workshop {
 
     /// Whether both surfaces have points near the foot: a crease is where surfaces meet, not where their continuations do.
     fn supported(&self, labels: [u8; 2], e: DVec3) -> bool {
-        const NEAR: f64 = 2.1;
+        const NEAR: f64 = 2.6;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
                 .filter(|i| {
