@@ -18,7 +18,7 @@ const MODEL_ERROR: f64 = 0.025;
 /// A point is marked when the edge passes within this many spacings.
 const THIN: f64 = 0.9;
 /// Share of the neighbours that must see an edge for it to be believed.
-fn agreement() -> f64 { std::env::var("AGR").map_or(0.3, |v| v.parse().unwrap()) }
+const AGREEMENT: f64 = 0.45;
 
 /// What the detector works on: distinct places in Morton order.
 pub(super) struct Places<'a> {
@@ -184,7 +184,7 @@ impl Places<'_> {
         for (foot, sight) in witnesses.iter().filter_map(|w| w.sight).take(8) {
             let (share, at) = fit_feet(witnesses, (foot, sight.tangent), unit);
             let distance = at.length();
-            if share >= agreement() && best.is_none_or(|b| distance < b.distance) {
+            if share >= AGREEMENT && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
                     foot: at * unit,
                     tangent: sight.tangent,

@@ -13,8 +13,6 @@ const STRAY: u8 = u8::MAX;
 /// A crease is believed where the criterion prefers it by this much, and disbelieved where it is against it by [`AGAINST`].
 const DECISIVE: f64 = 10.0;
 const AGAINST: f64 = 6.0;
-/// Surfaces are merged unless the criterion is against it by more than this.
-const SLIGHT: f64 = 2.0;
 /// Smallest turn angle, rad, that counts as sharp: 6 degrees.
 const LEAST_TURN: f64 = 0.105;
 /// Farthest foot, in spacings, that is of interest.
@@ -75,6 +73,9 @@ impl Workshop {
         if self.points.len() < 8 {
             return Verdict::Smooth;
         }
+        if let Some(verdict) = self.at_a_glance(variance) {
+            return verdict;
+        }
         let all = Plane::through(self.points.iter().copied());
         self.add_small_planes();
         self.seeds.push(all);
@@ -91,7 +92,24 @@ impl Workshop {
                 Verdict::Smooth
             };
         }
-        self.nearest_crease(&fits, (variance, most_turn))
+        match self.nearest_crease(&fits, (variance, most_turn)) {
+            Verdict::Smooth if doubt < AGAINST => Verdict::Unsure,
+            verdict => verdict,
+        }
+    }
+
+    /// The verdict where one smooth surface explains all points so well that no crease could be decisive.
+    fn at_a_glance(&self, variance: f64) -> Option<Verdict> {
+        let whole = fit(&self.points, variance, |_| true)?;
+        let n = self.points.len();
+        let expected = (n - whole.parameters.min(n)) as f64;
+        if whole.squares > variance * (expected + 0.5 * DECISIVE) {
+            return None;
+        }
+        let reach = self.points[n - 1].length();
+        let turn = 2.0 * whole.surface.curvature() * reach;
+        let smooth = turn < 0.7 * LEAST_TURN || turn > 1.5 * overlooked_turn(variance, n, reach);
+        Some(if smooth { Verdict::Smooth } else { Verdict::Unsure })
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -225,10 +243,10 @@ impl Workshop {
                 }
             }
             let Some((change, i, j, union)) = best else { break };
-            if change > SLIGHT {
+            if change > DECISIVE {
                 break;
             }
-            doubt = doubt.min(SLIGHT - change);
+            doubt = doubt.min(-change);
             let (from, to) = (fits[i].0, fits[j].0);
             for label in self.labels.iter_mut().filter(|l| **l == from) {
                 *label = to;
