@@ -148,7 +148,11 @@ impl Places<'_> {
         let apart = APART * reach / 3.57;
         for (_, i) in &shop.ranked {
             let at = shop.flanks.points[*i as usize];
-            if shop.taken.iter().all(|t: &DVec3| t.distance_squared(at) > apart * apart) {
+            if shop
+                .taken
+                .iter()
+                .all(|t: &DVec3| t.distance_squared(at) > apart * apart)
+            {
                 shop.taken.push(at);
                 let plane = &tangents.planes[shop.found[*i as usize].0 as usize];
                 let normal = plane.normal();
@@ -204,9 +208,11 @@ impl Places<'_> {
             Some((self.positions[*j as usize] + c - p) / unit)
         });
         let (mut sum, mut n) = (DVec3::ZERO, 0);
-        let nearest = corners
-            .clone()
-            .fold(DVec3::INFINITY, |a, b| if b.length() < a.length() { b } else { a });
+        let nearest =
+            corners.clone().fold(
+                DVec3::INFINITY,
+                |a, b| if b.length() < a.length() { b } else { a },
+            );
         for c in corners.filter(|c| c.distance_squared(nearest) < 1.5) {
             sum += c;
             n += 1;
@@ -254,7 +260,11 @@ fn fit_feet(witnesses: &[Witness], (foot, tangent): (DVec3, DVec3), unit: f64) -
             }
         }
     }
-    let share = if votes < 3 { 0.0 } else { f64::from(votes) / f64::from(expected) };
+    let share = if votes < 3 {
+        0.0
+    } else {
+        f64::from(votes) / f64::from(expected)
+    };
     // Bending is held back a little, so that few feet give a straight line.
     a[1][1] += 0.02 * a[0][0];
     a[2][2] += 0.1 * a[0][0];

@@ -109,7 +109,11 @@ impl Workshop {
         let reach = self.points[n - 1].length();
         let turn = 2.0 * whole.surface.curvature() * reach;
         let smooth = turn < 0.7 * LEAST_TURN || turn > 1.5 * overlooked_turn(variance, n, reach);
-        Some(if smooth { Verdict::Smooth } else { Verdict::Unsure })
+        Some(if smooth {
+            Verdict::Smooth
+        } else {
+            Verdict::Unsure
+        })
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -137,7 +141,13 @@ impl Workshop {
             self.seeds.push(Plane::through(
                 self.near[..k].iter().map(|(_, i)| points[*i as usize]),
             ));
-            at = (0..n).fold(0, |best, i| if self.costs[i] > self.costs[best] { i } else { best });
+            at = (0..n).fold(0, |best, i| {
+                if self.costs[i] > self.costs[best] {
+                    i
+                } else {
+                    best
+                }
+            });
         }
     }
 
@@ -147,8 +157,11 @@ impl Workshop {
         let cap = 9.0 * variance;
         self.costs.clear();
         for seed in &self.seeds {
-            self.costs
-                .extend(self.points.iter().map(|p| seed.distance(*p).powi(2).min(cap)));
+            self.costs.extend(
+                self.points
+                    .iter()
+                    .map(|p| seed.distance(*p).powi(2).min(cap)),
+            );
         }
         let row = |s: usize| &self.costs[s * n..(s + 1) * n];
         let single = (0..self.seeds.len())
@@ -176,7 +189,11 @@ impl Workshop {
             .collect();
         while chosen.len() < MOST_PLANES {
             let gain = |s: usize| -> f64 {
-                row(s).iter().zip(&so_far).map(|(a, b)| (b - a).max(0.0)).sum()
+                row(s)
+                    .iter()
+                    .zip(&so_far)
+                    .map(|(a, b)| (b - a).max(0.0))
+                    .sum()
             };
             let (s, g) = (0..self.seeds.len())
                 .map(|s| (s, gain(s)))
@@ -223,7 +240,8 @@ impl Workshop {
         let mut fits: Vec<(u8, Fit)> = (0..count)
             .filter_map(|s| {
                 let members = self.labels.iter().filter(|l| **l == s).count();
-                (members >= 4).then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
+                (members >= 4)
+                    .then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
                     .map(|f| (s, f))
             })
             .collect();
@@ -242,7 +260,9 @@ impl Workshop {
                     }
                 }
             }
-            let Some((change, i, j, union)) = best else { break };
+            let Some((change, i, j, union)) = best else {
+                break;
+            };
             if change > DECISIVE {
                 break;
             }
@@ -314,7 +334,11 @@ impl Workshop {
         }
         match best {
             Some((_, mut crease)) => {
-                crease.corner = if fits.len() > 2 { self.corner(fits) } else { None };
+                crease.corner = if fits.len() > 2 {
+                    self.corner(fits)
+                } else {
+                    None
+                };
                 Verdict::Creased(crease)
             }
             None if unsure => Verdict::Unsure,
@@ -349,7 +373,8 @@ impl Workshop {
             slope += if bent { 192.0 } else { 12.0 } / (n * length2);
         }
         let turn_sd = (variance * slope).sqrt();
-        let believable = turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        let believable =
+            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
         let crease = Crease {
             foot: e,
             tangent,
@@ -388,7 +413,9 @@ impl Workshop {
         const NEAR: f64 = 2.6;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
-                .filter(|i| self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR)
+                .filter(|i| {
+                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
+                })
                 .count();
             near >= 2
         })
