@@ -10,6 +10,8 @@ use acies::inspect::assign::Surface;
 use acies::inspect::body::Body;
 use acies::inspect::measure::{MeasureSettings, MeasuredEdge, measure_edges};
 use acies::inspect::result::Verdict;
+use acies::inspect::{Recipe, Request, inspect};
+use acies::nominal::Nominal;
 use acies::points::{Frame, Neighbors, PointCloud};
 use glam::{DVec2, DVec3};
 use solids::{ACROSS, ALONG, Made, Noise, Solid};
@@ -141,7 +143,7 @@ fn make(solid: &mut Solid, noise: &mut Noise) {
 fn edges_of_a_cuboid_are_measured_honestly() {
     let mut scores = Scores::default();
     let (mut ratio, mut stations) = (0.0, 0.0);
-    for seed in 1..=6 {
+    for seed in 1..=4 {
         let mut noise = Noise(seed);
         let solid = made_cuboid(&mut noise);
         let cloud = solid.scan(&[1, 2, 3, 4, 5], SIGMA, &mut noise);
@@ -180,7 +182,7 @@ fn a_wedge_and_a_concave_edge_are_measured_honestly() {
     let angle = ANGLE_PROFILE.map(DVec2::from);
     for (name, outline) in [("wedge", &wedge[..]), ("angle profile", &angle[..])] {
         let mut scores = Scores::default();
-        for seed in 1..=4 {
+        for seed in 1..=3 {
             let mut noise = Noise(seed);
             let mut solid = Solid::prism(outline, 12.0);
             make(&mut solid, &mut noise);
@@ -276,7 +278,7 @@ fn moved(cloud: &PointCloud, machine_from_part: &RigidTransform) -> PointCloud {
 #[test]
 fn a_rough_start_is_refined_to_within_its_covariance() {
     let (mut exact, mut made) = (0.0, 0.0);
-    const SEEDS: u64 = 4;
+    const SEEDS: u64 = 3;
     for seed in 1..=SEEDS {
         for with_deviations in [false, true] {
             let mut noise = Noise(seed);
@@ -317,7 +319,7 @@ fn a_rough_start_is_refined_to_within_its_covariance() {
             }
         }
     }
-    // Mean of 4 chi-squares of 6 degrees of freedom: 6, standard deviation 1.7; 3 of them.
+    // Mean of 3 chi-squares of 6 degrees of freedom: 6, standard deviation 2; 2.5 of them.
     let n = SEEDS as f64;
     println!(
         "mean chi-square: all faces {:.2}, datums {:.2}",
@@ -331,7 +333,7 @@ fn a_rough_start_is_refined_to_within_its_covariance() {
 #[test]
 fn faces_that_depart_widen_the_covariance() {
     let mut sum = 0.0;
-    for seed in 1..=6 {
+    for seed in 1..=4 {
         let mut noise = Noise(seed);
         let mut solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
         make(&mut solid, &mut noise);
@@ -350,8 +352,8 @@ fn faces_that_depart_widen_the_covariance() {
         );
         sum += squared;
     }
-    println!("mean {:.2}", sum / 6.0);
-    assert!(sum / 6.0 < 18.0);
+    println!("mean {:.2}", sum / 4.0);
+    assert!(sum / 4.0 < 18.0);
 }
 
 #[test]
@@ -426,7 +428,7 @@ fn touches_hold_what_the_scan_does_not() {
 
 #[test]
 fn a_pose_is_found_from_nothing() {
-    for seed in 1..=3 {
+    for seed in 1..=1 {
         let mut noise = Noise(seed);
         let solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
         let angle = 3.0 * noise.uniform();
@@ -474,4 +476,59 @@ fn a_symmetric_part_is_ambiguous() {
         "a cuboid maps onto itself by the identity and three half turns: {:?}",
         aligned.findings
     );
+}
+
+/// The whole way through on a part read from STEP, with plane, cylindrical and free-form faces.
+#[test]
+fn a_part_read_from_step_and_sampled_as_drawn_has_no_deviation() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo/part.step");
+    let nominal = Nominal::read(&path).expect("the demo's part");
+    let mut noise = Noise(4);
+    let positions: Vec<DVec3> = Nominal::samples(&nominal, 0.25)
+        .into_iter()
+        .map(|s| s.point + SIGMA * noise.normal() * s.normal)
+        .collect();
+    println!("{} points", positions.len());
+    let cloud = PointCloud::from_positions(Frame::Part, positions);
+    let recipe = Recipe::parse("rule = { guard_band = 2.0 }\n[limits]\nd_mm = [-0.05, 0.05]")
+        .expect("a recipe");
+    let inspection = inspect(&cloud, &nominal, &Request::new(&recipe, Start::None));
+    println!(
+        "{:?} {:?} {:?}",
+        inspection.seconds, inspection.missing_edges, inspection.findings
+    );
+    let (mut square, mut inside, mut n) = (0.0, 0.0, 0.0);
+    for edge in &inspection.edges {
+        let mut worst = 0.0f64;
+        for station in &edge.stations {
+            let Some(m) = &station.measured else { continue };
+            for i in 0..2 {
+                let z = m.d_mm[i] / m.u_d_mm[i];
+                square += z * z;
+                inside += f64::from(z.abs() < 2.0);
+                n += 1.0;
+                worst = worst.max(m.d_mm[i].abs());
+            }
+        }
+        println!(
+            "{} {:?} {:.1} mm, coverage {:.2}, worst {:.4}, {:?}, {:?}",
+            edge.id,
+            edge.kind,
+            edge.length_mm,
+            edge.coverage,
+            worst,
+            edge.verdict,
+            edge.stations
+                .iter()
+                .map(|s| &s.reason)
+                .find(|r| !r.is_empty())
+        );
+    }
+    let (rms, share) = ((square / n as f64).sqrt(), inside / n);
+    println!(
+        "n {n}, z rms {rms:.3}, within two {share:.3}, unexpected {}",
+        inspection.unexpected_edges.len()
+    );
+    assert!((0.85..1.15).contains(&rms), "{rms}");
+    assert!((0.92..0.99).contains(&share), "{share}");
 }

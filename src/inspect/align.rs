@@ -231,7 +231,8 @@ impl<B: Body> Task<'_, B> {
             return self.failed(TOO_FEW.to_string());
         };
         let fine = self.scan.subset(FINAL_POINTS);
-        let gate = (0.01 * self.size_mm).max(10.0 * self.scan.noise_mm);
+        // Wide enough that a face which is off stays in sight and is counted as form.
+        let gate = (0.05 * self.size_mm).max(10.0 * self.scan.noise_mm);
         let mut last = None;
         for _ in 0..12 {
             let observations = self.observe(&pose, &fine, gate);
