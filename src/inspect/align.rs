@@ -435,14 +435,10 @@ impl<B: Body> Task<'_, B> {
                 &scaling,
             )
         };
-        let by_face = form_by(|o, _| u64::from(o.face));
-        let by_patch = form_by(patch_of);
-        let larger = if by_face.trace() > by_patch.trace() {
-            by_face
-        } else {
-            by_patch
-        };
-        let mut scaled = inverse * self.white_variance(observations, step) + larger;
+        // Faces shift, and patches bend and tilt them: the first moves the part, the second turns it.
+        let faces = form_by(|o, _| u64::from(o.face));
+        let patches = form_by(patch_of);
+        let mut scaled = inverse * self.white_variance(observations, step) + faces + patches;
         for weak in &step.weak {
             scaled += weak * weak.transpose() * self.size_mm.powi(2);
         }
