@@ -1,5 +1,10 @@
 //! Inspection against exact solids whose deviations are known: honesty of every uncertainty, reasons, alignment.
 
+#![allow(
+    clippy::print_stdout,
+    reason = "the figures are to be seen with --nocapture"
+)]
+
 #[path = "inspect/solids.rs"]
 mod solids;
 
@@ -65,10 +70,10 @@ impl Scores {
                     continue;
                 };
                 let expected = solid.true_d(e, &station.station);
-                for i in 0..2 {
+                for (i, sum) in truth.iter_mut().enumerate() {
                     self.z
                         .push((measured.d_mm[i] - expected[i]) / measured.u_d_mm[i]);
-                    truth[i] += expected[i];
+                    *sum += expected[i];
                 }
                 n += 1.0;
                 let nominal = acies::inspect::virtual_edge::nominal_angle(
