@@ -9,7 +9,7 @@ use acies::points::{
     Column, Encoding, Format, Frame, Origin, PointCloud, PointsError, Read, Unit, View, parse,
     read, write_ply, write_scan, write_xyz,
 };
-use glam::{DQuat, DVec3};
+use glam::DVec3;
 use proptest::prelude::*;
 
 fn parsed(name: &str, bytes: impl AsRef<[u8]>) -> Result<Read, PointsError> {
@@ -965,122 +965,6 @@ fn a_write_replaces_the_file_whole_or_not_at_all() {
     assert!(
         write_atomically(Path::new("/dev/null"), b"gone").is_ok(),
         "a device is written to as it is"
-    );
-}
-
-#[test]
-fn clouds_are_joined_with_their_views_numbered_on() {
-    let view = |name: &str| View {
-        device: name.into(),
-        towards_sensor: DVec3::Z,
-    };
-    let cloud = |x: f64, views: &[&str]| PointCloud {
-        frame: Frame::Machine,
-        positions: vec![DVec3::X * x; views.len()],
-        origins: (0..views.len() as u16)
-            .map(|view| Origin {
-                view,
-                column: 7,
-                profile: 9,
-            })
-            .collect(),
-        views: views.iter().map(|v| view(v)).collect(),
-    };
-    let merged = PointCloud::merge(&[cloud(1.0, &["a", "b"]), cloud(2.0, &["c"])]).unwrap();
-    assert_eq!(merged.views, ["a", "b", "c"].map(view));
-    assert_eq!(
-        merged.origins.iter().map(|o| o.view).collect::<Vec<_>>(),
-        [0, 1, 2]
-    );
-    assert_eq!(merged.positions, [DVec3::X, DVec3::X, DVec3::X * 2.0]);
-
-    let bare = PointCloud::from_positions(Frame::Machine, vec![DVec3::ZERO]);
-    let mixed = PointCloud::merge(&[cloud(1.0, &["a"]), bare]).unwrap();
-    assert_eq!(
-        (mixed.len(), mixed.origins.len(), mixed.views.len()),
-        (2, 0, 0)
-    );
-
-    let other = PointCloud::from_positions(Frame::Part, vec![DVec3::ZERO]);
-    assert_eq!(
-        PointCloud::merge(&[cloud(1.0, &["a"]), other])
-            .unwrap_err()
-            .to_string(),
-        "point cloud: points in the Machine and the Part frame, expected one frame; build the cloud from one scan"
-    );
-    assert_eq!(
-        PointCloud::merge(&[]).unwrap_err().to_string(),
-        "point cloud: no cloud to join, expected at least one; build the cloud from one scan"
-    );
-    let many = PointCloud {
-        views: vec![view("a"); 65_536],
-        ..cloud(1.0, &["a"])
-    };
-    assert_eq!(
-        PointCloud::merge(&[many, cloud(1.0, &["a"])])
-            .unwrap_err()
-            .to_string(),
-        "point cloud: 65537 views, expected at most 65536 views; build the cloud from one scan"
-    );
-}
-
-#[test]
-fn a_cloud_is_moved_bounded_and_cut() {
-    let cloud = PointCloud {
-        frame: Frame::Sensor,
-        positions: vec![
-            DVec3::new(1.0, 5.0, -2.0),
-            DVec3::new(3.0, -1.0, 0.0),
-            DVec3::new(f64::NAN, 0.0, 0.0),
-        ],
-        origins: (0..3)
-            .map(|column| Origin {
-                view: 0,
-                column,
-                profile: 0,
-            })
-            .collect(),
-        views: vec![View {
-            device: "a".into(),
-            towards_sensor: DVec3::X,
-        }],
-    };
-    let (finite, finding) = cloud.remove_non_finite();
-    assert_eq!(
-        finding.as_deref(),
-        Some("1 of 3 points were not finite and were left out")
-    );
-    assert_eq!(finite.origins.len(), 2);
-    assert_eq!(
-        finite.bounds(),
-        Some((DVec3::new(1.0, -1.0, -2.0), DVec3::new(3.0, 5.0, 0.0)))
-    );
-    assert_eq!(
-        PointCloud::from_positions(Frame::Part, vec![]).bounds(),
-        None
-    );
-
-    let quarter = DQuat::from_rotation_z(std::f64::consts::FRAC_PI_2);
-    let moved = finite.map(Frame::Machine, |p| quarter * p + DVec3::Z, |d| quarter * d);
-    assert_eq!(moved.frame, Frame::Machine);
-    assert!(
-        (moved.positions[0] - DVec3::new(-5.0, 1.0, -1.0)).length() < 1e-14,
-        "rounding of one rotation"
-    );
-    assert!(
-        (moved.views[0].towards_sensor - DVec3::Y).length() < 1e-15,
-        "rounding of one rotation"
-    );
-
-    let cut = finite.subset(&[1, 1, 0]);
-    assert_eq!(cut.positions[2], finite.positions[0]);
-    assert_eq!(
-        cut.origins.iter().map(|o| o.column).collect::<Vec<_>>(),
-        [1, 1, 0]
-    );
-    assert_eq!(
-        cut.duplicates_finding().as_deref(),
-        Some("1 of 3 points lie exactly on an earlier point")
     );
 }
 

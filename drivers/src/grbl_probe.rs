@@ -6,6 +6,26 @@
 //! the work offset is read at opening and taken off; after an alarm everything is locked until `$X` or `$H`.
 //!
 //! What counts is the position that the controller latched at contact, never a position asked for afterwards.
+//!
+//! # Configuration
+//!
+//! Only the link is needed. Places are in machine axes, mm.
+//!
+//! ```toml
+//! port = "/dev/ttyUSB0"         # or one of the next three in its place
+//! # usb_serial = "A50285BI"     # serial number of the USB converter: the same after plugging in again
+//! # usb_id = "1a86:7523"        # vendor and product of a converter without one
+//! # address = "10.0.0.6:23"     # TCP, as of a network bridge
+//! baud = 115200                 # serial ports only
+//! build_info = "probe 7"        # text that `$I=` wrote into the controller: another one is refused
+//! feed_mm_min = 100.0           # of probing moves
+//! rapid = true                  # to the start with G0; otherwise with G1 at the feed above
+//! safe_z_mm = 150.0             # the way to a start goes up to this, across, and down; straight where not given
+//! retract_mm = 2.0              # back from the contact, never behind the start
+//! limits_min_mm = [0.0, 0.0, -80.0] # box that starts and targets must lie in
+//! limits_max_mm = [300.0, 200.0, 160.0]
+//! unlock_on_open = false        # send $X at opening, where an alarm has locked the machine
+//! ```
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -76,12 +96,13 @@ fn configure(table: toml::Table) -> Configured {
     let mut keys = Keys::new(table);
     let target = keys.target(BAUD);
     let build_info = keys.text("build_info");
+    let limits_mm = limits(&mut keys);
     let motion = Motion {
         feed_mm_min: keys.number("feed_mm_min", 1.0..=5000.0).unwrap_or(100.0),
         rapid: keys.flag("rapid").unwrap_or(true),
-        safe_z_mm: keys.number("safe_z_mm", -1e4..=1e4),
+        safe_z_mm: safe_z(&mut keys, limits_mm),
         retract_mm: keys.number("retract_mm", 0.0..=100.0).unwrap_or(2.0),
-        limits_mm: limits(&mut keys),
+        limits_mm,
     };
     let unlock_on_open = keys.flag("unlock_on_open").unwrap_or(false);
     keys.finish()?;
@@ -95,6 +116,17 @@ fn configure(table: toml::Table) -> Configured {
         motion,
         unlock_on_open,
     }))
+}
+
+fn safe_z(keys: &mut Keys, limits_mm: Option<[[f64; 3]; 2]>) -> Option<f64> {
+    let z_mm = keys.number("safe_z_mm", -1e4..=1e4)?;
+    if let Some([least, most]) = limits_mm
+        && !(least[2]..=most[2]).contains(&z_mm)
+    {
+        let expected = format!("{} to {}, the limits of z", least[2], most[2]);
+        keys.wrong("safe_z_mm", z_mm, &expected);
+    }
+    Some(z_mm)
 }
 
 fn limits(keys: &mut Keys) -> Option<[[f64; 3]; 2]> {
@@ -592,7 +624,7 @@ impl GrblProbe {
         let to = [0, 1, 2].map(|axis| contact_mm[axis] - back_mm * way.direction[axis]);
         let text = self.travel(&self.frame.words(to));
         let outcome = self.motion(&text, Limit::from_now(RETRACT), |_| {})?;
-        self.controller.checked("G0", outcome)
+        self.controller.checked(&text[..2], outcome)
     }
 
     /// Goes to the start: straight, or over the safe height where one is set.
@@ -610,7 +642,7 @@ impl GrblProbe {
         for leg in legs {
             let text = self.travel(&leg);
             let outcome = self.motion(&text, limit, |_| {})?;
-            self.controller.checked("G0", outcome)?;
+            self.controller.checked(&text[..2], outcome)?;
         }
         Ok(())
     }

@@ -2,6 +2,26 @@
 //!
 //! Manual: `drivers/open-profile.md`, version 1. Quirks: none known; a device that was streaming for a host that died is
 //! stopped before it is asked anything.
+//!
+//! # Configuration
+//!
+//! Only the link is needed; what is not given stays as the device has it.
+//!
+//! ```toml
+//! port = "/dev/ttyACM0"         # or one of the next three in its place
+//! # usb_serial = "A50285BI"     # serial number of the USB converter: the same after plugging in again
+//! # usb_id = "0403:6001"        # vendor and product of a converter without one
+//! # address = "10.0.0.5:7450"   # TCP
+//! baud = 921600                 # serial ports only
+//! serial_number = "P-0042"      # of the profiler: another one is refused
+//! trigger = "encoder"           # "time", "encoder" or "external"
+//! encoder_step = 20             # counts between profiles, by the encoder
+//! columns = 640                 # points in a profile
+//! rate_hz = 500.0               # profiles a second
+//! exposure_us = 200.0           # of one profile
+//! laser_power_percent = 100.0   # of full power
+//! keepalive_s = 0.5             # 0.1 to 10; the laser of a host that died is off after three times this
+//! ```
 
 use std::sync::Arc;
 use std::thread::JoinHandle;

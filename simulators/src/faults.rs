@@ -37,6 +37,8 @@ pub struct Faults {
     pub lumps: bool,
     /// `split`: bytes arrive in random pieces.
     pub split: bool,
+    /// `baud=N`: the line runs at N Bd: unless the host sets its port to that, all it reads and writes is rubbish (not over TCP).
+    pub baud: Option<u32>,
     /// `no-contact`: the probe never triggers.
     pub no_contact: bool,
     /// `damage-prb=N`: the answer of the N-th probing move (from 1) is torn by a status report.
@@ -74,7 +76,7 @@ pub enum FaultError {
     },
 }
 
-const NAMES: [&str; 18] = [
+const NAMES: [&str; 19] = [
     "lose=P",
     "flip=P",
     "lie=P",
@@ -89,6 +91,7 @@ const NAMES: [&str; 18] = [
     "replug-ms=M",
     "lumps",
     "split",
+    "baud=N",
     "no-contact",
     "damage-prb=N",
     "alarm",
@@ -151,6 +154,7 @@ impl Faults {
             "replug-ms" => self.replug = Some(Duration::from_millis(count()?.into())),
             "lumps" => self.lumps = nothing()?,
             "split" => self.split = nothing()?,
+            "baud" => self.baud = Some(count()?),
             "no-contact" => self.no_contact = nothing()?,
             "damage-prb" => self.damage_prb = Some(count()?),
             "alarm" => self.alarm = nothing()?,

@@ -129,6 +129,12 @@ impl PtyDevice {
         }
     }
 
+    /// Speed the host has set, in Bd; nothing when unplugged. A pseudo-terminal keeps it and does not heed it.
+    pub fn baud(&self) -> Option<u32> {
+        let ends = self.ends.as_ref()?;
+        Some(tcgetattr(&ends.master).ok()?.output_speed())
+    }
+
     /// What is there, without waiting; 0 when nothing is.
     ///
     /// # Errors

@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use rand::{Rng, SeedableRng};
+use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rustix::event::{EventfdFlags, eventfd};
 
@@ -300,7 +300,9 @@ impl Runner {
             waker: waker.clone(),
             requests: requests.clone(),
             lumps: faults.lumps,
-            split: faults.split.then_some(rng),
+            split: faults.split,
+            baud: faults.baud,
+            rng,
             replug_after: faults.replug,
             replug_at: None,
             next_lump: Instant::now(),
@@ -350,7 +352,9 @@ struct Serving<M> {
     waker: Waker,
     requests: Arc<Requests>,
     lumps: bool,
-    split: Option<ChaCha8Rng>,
+    split: bool,
+    baud: Option<u32>,
+    rng: ChaCha8Rng,
     replug_after: Option<Duration>,
     replug_at: Option<Instant>,
     next_lump: Instant,
@@ -442,6 +446,14 @@ impl<M: Model> Serving<M> {
         }
     }
 
+    /// Whether the host's port runs at another speed than the line.
+    fn garbled(&self) -> bool {
+        match (&self.wire, self.baud) {
+            (Wire::Pty(pty), Some(baud)) => pty.baud().is_some_and(|set| set != baud),
+            _ => false,
+        }
+    }
+
     /// Sends what goes, in lumps or pieces where asked.
     fn send(&mut self) -> bool {
         if self.lumps && self.out.len() > 0 {
@@ -451,14 +463,23 @@ impl<M: Model> Serving<M> {
             }
             self.next_lump = now + LUMP;
         }
+        let garbled = self.garbled();
         while self.out.len() > 0 && self.wire.has_host() {
             let (front, _) = self.out.bytes.as_slices();
-            let most = match &mut self.split {
-                Some(rng) => rng.random_range(1..=200),
-                None => front.len(),
+            let most = if self.split {
+                self.rng.random_range(1..=200)
+            } else {
+                front.len()
             };
-            let piece = front.len().min(most);
-            match self.wire.write(&front[..piece]) {
+            let piece = &front[..front.len().min(most)];
+            let written = if garbled {
+                let mut rubbish = vec![0; piece.len()];
+                self.rng.fill_bytes(&mut rubbish);
+                self.wire.write(&rubbish)
+            } else {
+                self.wire.write(piece)
+            };
+            match written {
                 Ok(0) => break,
                 Ok(n) => self.out.sent(n),
                 Err(_) => return false,

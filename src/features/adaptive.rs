@@ -18,9 +18,7 @@ const MODEL_ERROR: f64 = 0.025;
 /// A point is marked when the edge passes within this many spacings.
 const THIN: f64 = 0.9;
 /// Share of the neighbours that must see an edge for it to be believed.
-fn agreement() -> f64 {
-    std::env::var("AGR").map_or(0.3, |v| v.parse().unwrap())
-}
+const AGREEMENT: f64 = 0.45;
 
 /// What the detector works on: distinct places in Morton order.
 pub(super) struct Places<'a> {
@@ -150,11 +148,7 @@ impl Places<'_> {
         let apart = APART * reach / 3.57;
         for (_, i) in &shop.ranked {
             let at = shop.flanks.points[*i as usize];
-            if shop
-                .taken
-                .iter()
-                .all(|t: &DVec3| t.distance_squared(at) > apart * apart)
-            {
+            if shop.taken.iter().all(|t: &DVec3| t.distance_squared(at) > apart * apart) {
                 shop.taken.push(at);
                 let plane = &tangents.planes[shop.found[*i as usize].0 as usize];
                 let normal = plane.normal();
@@ -190,7 +184,7 @@ impl Places<'_> {
         for (foot, sight) in witnesses.iter().filter_map(|w| w.sight).take(8) {
             let (share, at) = fit_feet(witnesses, (foot, sight.tangent), unit);
             let distance = at.length();
-            if share >= agreement() && best.is_none_or(|b| distance < b.distance) {
+            if share >= AGREEMENT && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
                     foot: at * unit,
                     tangent: sight.tangent,
@@ -210,11 +204,9 @@ impl Places<'_> {
             Some((self.positions[*j as usize] + c - p) / unit)
         });
         let (mut sum, mut n) = (DVec3::ZERO, 0);
-        let nearest =
-            corners.clone().fold(
-                DVec3::INFINITY,
-                |a, b| if b.length() < a.length() { b } else { a },
-            );
+        let nearest = corners
+            .clone()
+            .fold(DVec3::INFINITY, |a, b| if b.length() < a.length() { b } else { a });
         for c in corners.filter(|c| c.distance_squared(nearest) < 1.5) {
             sum += c;
             n += 1;
@@ -262,11 +254,7 @@ fn fit_feet(witnesses: &[Witness], (foot, tangent): (DVec3, DVec3), unit: f64) -
             }
         }
     }
-    let share = if votes < 3 {
-        0.0
-    } else {
-        f64::from(votes) / f64::from(expected)
-    };
+    let share = if votes < 3 { 0.0 } else { f64::from(votes) / f64::from(expected) };
     // Bending is held back a little, so that few feet give a straight line.
     a[1][1] += 0.02 * a[0][0];
     a[2][2] += 0.1 * a[0][0];

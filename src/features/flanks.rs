@@ -13,8 +13,6 @@ const STRAY: u8 = u8::MAX;
 /// A crease is believed where the criterion prefers it by this much, and disbelieved where it is against it by [`AGAINST`].
 const DECISIVE: f64 = 10.0;
 const AGAINST: f64 = 6.0;
-/// Surfaces are merged unless the criterion is against it by more than this.
-const SLIGHT: f64 = 2.0;
 /// Smallest turn angle, rad, that counts as sharp: 6 degrees.
 const LEAST_TURN: f64 = 0.105;
 /// Farthest foot, in spacings, that is of interest.
@@ -75,6 +73,9 @@ impl Workshop {
         if self.points.len() < 8 {
             return Verdict::Smooth;
         }
+        if let Some(verdict) = self.at_a_glance(variance) {
+            return verdict;
+        }
         let all = Plane::through(self.points.iter().copied());
         self.add_small_planes();
         self.seeds.push(all);
@@ -91,7 +92,24 @@ impl Workshop {
                 Verdict::Smooth
             };
         }
-        self.nearest_crease(&fits, (variance, most_turn))
+        match self.nearest_crease(&fits, (variance, most_turn)) {
+            Verdict::Smooth if doubt < AGAINST => Verdict::Unsure,
+            verdict => verdict,
+        }
+    }
+
+    /// The verdict where one smooth surface explains all points so well that no crease could be decisive.
+    fn at_a_glance(&self, variance: f64) -> Option<Verdict> {
+        let whole = fit(&self.points, variance, |_| true)?;
+        let n = self.points.len();
+        let expected = (n - whole.parameters.min(n)) as f64;
+        if whole.squares > variance * (expected + 0.5 * DECISIVE) {
+            return None;
+        }
+        let reach = self.points[n - 1].length();
+        let turn = 2.0 * whole.surface.curvature() * reach;
+        let smooth = turn < 0.7 * LEAST_TURN || turn > 1.5 * overlooked_turn(variance, n, reach);
+        Some(if smooth { Verdict::Smooth } else { Verdict::Unsure })
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -119,13 +137,7 @@ impl Workshop {
             self.seeds.push(Plane::through(
                 self.near[..k].iter().map(|(_, i)| points[*i as usize]),
             ));
-            at = (0..n).fold(0, |best, i| {
-                if self.costs[i] > self.costs[best] {
-                    i
-                } else {
-                    best
-                }
-            });
+            at = (0..n).fold(0, |best, i| if self.costs[i] > self.costs[best] { i } else { best });
         }
     }
 
@@ -135,11 +147,8 @@ impl Workshop {
         let cap = 9.0 * variance;
         self.costs.clear();
         for seed in &self.seeds {
-            self.costs.extend(
-                self.points
-                    .iter()
-                    .map(|p| seed.distance(*p).powi(2).min(cap)),
-            );
+            self.costs
+                .extend(self.points.iter().map(|p| seed.distance(*p).powi(2).min(cap)));
         }
         let row = |s: usize| &self.costs[s * n..(s + 1) * n];
         let single = (0..self.seeds.len())
@@ -167,11 +176,7 @@ impl Workshop {
             .collect();
         while chosen.len() < MOST_PLANES {
             let gain = |s: usize| -> f64 {
-                row(s)
-                    .iter()
-                    .zip(&so_far)
-                    .map(|(a, b)| (b - a).max(0.0))
-                    .sum()
+                row(s).iter().zip(&so_far).map(|(a, b)| (b - a).max(0.0)).sum()
             };
             let (s, g) = (0..self.seeds.len())
                 .map(|s| (s, gain(s)))
@@ -218,8 +223,7 @@ impl Workshop {
         let mut fits: Vec<(u8, Fit)> = (0..count)
             .filter_map(|s| {
                 let members = self.labels.iter().filter(|l| **l == s).count();
-                (members >= 4)
-                    .then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
+                (members >= 4).then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
                     .map(|f| (s, f))
             })
             .collect();
@@ -238,13 +242,11 @@ impl Workshop {
                     }
                 }
             }
-            let Some((change, i, j, union)) = best else {
-                break;
-            };
-            if change > SLIGHT {
+            let Some((change, i, j, union)) = best else { break };
+            if change > DECISIVE {
                 break;
             }
-            doubt = doubt.min(SLIGHT - change);
+            doubt = doubt.min(-change);
             let (from, to) = (fits[i].0, fits[j].0);
             for label in self.labels.iter_mut().filter(|l| **l == from) {
                 *label = to;
@@ -262,17 +264,9 @@ impl Workshop {
     fn split(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<([Fit; 2], Fit)> {
         let mut parts = [one.1, other.1];
         let either = |i: usize| self.labels[i] == one.0 || self.labels[i] == other.0;
-        let mut facing = [0.0; 2];
-        for (i, p) in self.points.iter().enumerate() {
-            if self.labels[i] == one.0 {
-                facing[0] += parts[1].surface.distance(*p);
-            } else if self.labels[i] == other.0 {
-                facing[1] += parts[0].surface.distance(*p);
-            }
-        }
-        let facing = facing.map(f64::signum);
         for _ in 0..2 {
             let [a, b] = [parts[0].surface, parts[1].surface];
+            let facing = self.facing([one.0, other.0], &[a, b]);
             let second = |i: usize| {
                 let p = self.points[i];
                 facing[0] * b.distance(p) < facing[1] * a.distance(p)
@@ -284,6 +278,19 @@ impl Workshop {
         }
         let whole = fit(&self.points, variance, either)?;
         Some((parts, whole))
+    }
+
+    /// On which side of the other surface each one's points lie: their signs.
+    fn facing(&self, labels: [u8; 2], surfaces: &[Surface; 2]) -> [f64; 2] {
+        let mut sums = [0.0; 2];
+        for (p, label) in self.points.iter().zip(&self.labels) {
+            if *label == labels[0] {
+                sums[0] += surfaces[1].distance(*p);
+            } else if *label == labels[1] {
+                sums[1] += surfaces[0].distance(*p);
+            }
+        }
+        sums.map(f64::signum)
     }
 
     /// The nearest decisive crease between two of the surfaces.
@@ -307,11 +314,7 @@ impl Workshop {
         }
         match best {
             Some((_, mut crease)) => {
-                crease.corner = if fits.len() > 2 {
-                    self.corner(fits)
-                } else {
-                    None
-                };
+                crease.corner = if fits.len() > 2 { self.corner(fits) } else { None };
                 Verdict::Creased(crease)
             }
             None if unsure => Verdict::Unsure,
@@ -346,8 +349,7 @@ impl Workshop {
             slope += if bent { 192.0 } else { 12.0 } / (n * length2);
         }
         let turn_sd = (variance * slope).sqrt();
-        let believable =
-            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        let believable = turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
         let crease = Crease {
             foot: e,
             tangent,
@@ -383,12 +385,10 @@ impl Workshop {
 
     /// Whether both surfaces have points near the foot: a crease is where surfaces meet, not where their continuations do.
     fn supported(&self, labels: [u8; 2], e: DVec3) -> bool {
-        const NEAR: f64 = 2.1;
+        const NEAR: f64 = 2.6;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
-                .filter(|i| {
-                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
-                })
+                .filter(|i| self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR)
                 .count();
             near >= 2
         })

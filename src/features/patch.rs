@@ -90,6 +90,13 @@ impl Surface {
         h / gradient.length()
     }
 
+    /// Largest curvature at the middle of the fit, for a frame nearly tangent.
+    pub fn curvature(&self) -> f64 {
+        let [xx, xy, yy] = [2.0 * self.coefficients[3], self.coefficients[4], 2.0 * self.coefficients[5]];
+        let mean = 0.5 * (xx + yy);
+        mean.abs() + (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
+    }
+
     /// Whether the surface is curved.
     pub fn is_curved(&self) -> bool {
         self.coefficients[3..].iter().any(|c| *c != 0.0)

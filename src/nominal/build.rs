@@ -78,7 +78,7 @@ fn what_instead(file: &Part21) -> String {
         ("GEOMETRIC_CURVE_SET", "wireframe"),
         ("GEOMETRIC_SET", "geometric set"),
         ("CSG_SOLID", "CSG solid"),
-        ("ADVANCED_FACE", "face outside any body"),
+        ("ADVANCED_FACE", "loose face"),
     ];
     let found: Vec<String> = kinds
         .iter()

@@ -507,14 +507,21 @@ fn all_mistakes_of_a_table_are_told_at_once() {
         ),
         [
             "port: no link, expected exactly one of port, usb_serial, usb_id, address",
+            "limits_max_mm: [1.0, 1.0, 0.0], expected more than limits_min_mm on every axis",
             "feed_mm_min: 0, expected a number of 1 to 5000",
             "rapid: 1, expected true or false",
             "retract_mm: -1, expected a number of 0 to 100",
-            "limits_max_mm: [1.0, 1.0, 0.0], expected more than limits_min_mm on every axis",
             "unlock_on_open: \"no\", expected true or false",
-            "feed: an unknown key, expected one of baud, port, usb_serial, usb_id, address, build_info, feed_mm_min, \
-             rapid, safe_z_mm, retract_mm, limits_min_mm, limits_max_mm, unlock_on_open",
+            "feed: an unknown key, expected one of baud, port, usb_serial, usb_id, address, build_info, limits_min_mm, \
+             limits_max_mm, feed_mm_min, rapid, safe_z_mm, retract_mm, unlock_on_open",
         ]
+    );
+    assert_eq!(
+        mistakes(
+            "grbl-probe",
+            "port = '/dev/x'\nlimits_min_mm = [0, 0, 0]\nlimits_max_mm = [1, 1, 1]\nsafe_z_mm = 2"
+        ),
+        ["safe_z_mm: 2, expected 0 to 1, the limits of z"]
     );
     assert_eq!(
         mistakes("grbl-probe", "port = '/dev/x'\nlimits_min_mm = [0, 0]"),

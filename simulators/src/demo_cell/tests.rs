@@ -144,3 +144,29 @@ fn a_profile_of_the_cell_lies_on_the_part() {
         assert!(seen > 400, "{} sees {seen}", sensor.name);
     }
 }
+
+#[test]
+fn the_configuration_states_the_poses_of_the_sensors() {
+    let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../configs/demo/cell.toml");
+    let text = std::fs::read_to_string(path).unwrap();
+    let sections = text.split("[device.calibration]").skip(1);
+    let cell = DemoCell::new(1);
+    let mut compared = 0;
+    for (section, sensor) in sections.zip(&cell.sensors) {
+        let vector = |key: &str| {
+            let start = section.find(&format!("{key} = [")).unwrap() + key.len() + 4;
+            let inner = &section[start..start + section[start..].find(']').unwrap()];
+            let numbers: Vec<f64> = inner
+                .split(',')
+                .map(|n| n.trim().parse().unwrap())
+                .collect();
+            DVec3::from_slice(&numbers)
+        };
+        let stated = sensor.stated_machine_from_sensor;
+        assert_eq!(vector("origin_mm"), stated.translation);
+        assert!(vector("x_axis").distance(stated.rotation.x_axis) < 1e-15);
+        assert!(vector("z_axis").distance(stated.rotation.z_axis) < 1e-15);
+        compared += 1;
+    }
+    assert_eq!(compared, 2);
+}

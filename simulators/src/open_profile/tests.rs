@@ -336,6 +336,17 @@ fn the_cable_can_be_pulled_in_mid_scan_and_put_back() {
     assert!(device.wait_until(PATIENCE, |s| !s.plugged && !s.laser_on));
 }
 
+#[test]
+fn the_cable_can_come_back_by_itself() {
+    let device = device("replug", "unplug-after=5,replug-ms=30", view(40, 60));
+    let mut host = Host::open(&device);
+    host.start(1, 0, 10_000);
+    assert_eq!(sequences(&host.until_stopped().0).len(), 5);
+    assert!(device.wait_until(PATIENCE, |s| s.plugged && s.boots == 2));
+    let mut host = Host::open(&device);
+    assert_eq!(host.ask(msg::HELLO, 1, &[]).kind, msg::IDENTITY);
+}
+
 /// Runs all 300 profiles and accounts for every one.
 fn account(name: &str, faults: &str) -> (Vec<u8>, Truth) {
     let device = device(name, faults, view(30, 300));
@@ -424,6 +435,24 @@ fn a_silent_device_answers_nothing() {
     let mut host = Host::open(&device);
     host.send(msg::HELLO, 1, &[]);
     assert_eq!(host.next(Duration::from_millis(150)), None);
+}
+
+#[test]
+fn at_the_wrong_speed_all_is_rubbish() {
+    use rustix::termios::{OptionalActions, tcgetattr, tcsetattr};
+    let device = device("baud", "baud=921600", view(40, 10));
+    let mut host = Host::open(&device);
+    host.send(msg::HELLO, 1, &[]);
+    assert_eq!(host.next(Duration::from_millis(150)), None);
+    let mut termios = tcgetattr(&host.stream).unwrap();
+    termios.set_speed(921_600).unwrap();
+    tcsetattr(&host.stream, OptionalActions::Now, &termios).unwrap();
+    // the device may still wait for the rest of what looked like a frame; a host asks again
+    let answer = (0..20).find_map(|id| {
+        host.send(msg::HELLO, id, &[]);
+        host.next(Duration::from_secs(1))
+    });
+    assert_eq!(answer.unwrap().kind, msg::IDENTITY);
 }
 
 #[test]
