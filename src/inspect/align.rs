@@ -231,7 +231,8 @@ impl<B: Body> Task<'_, B> {
             return self.failed(TOO_FEW.to_string());
         };
         let fine = self.scan.subset(FINAL_POINTS);
-        let gate = (0.01 * self.size_mm).max(10.0 * self.scan.noise_mm);
+        // Wide enough that a face which is off stays in sight and is counted as form.
+        let gate = (0.05 * self.size_mm).max(10.0 * self.scan.noise_mm);
         let mut last = None;
         for _ in 0..12 {
             let observations = self.observe(&pose, &fine, gate);
@@ -434,14 +435,10 @@ impl<B: Body> Task<'_, B> {
                 &scaling,
             )
         };
-        let by_face = form_by(|o, _| u64::from(o.face));
-        let by_patch = form_by(patch_of);
-        let larger = if by_face.trace() > by_patch.trace() {
-            by_face
-        } else {
-            by_patch
-        };
-        let mut scaled = inverse * self.white_variance(observations, step) + larger;
+        // Faces shift, and patches bend and tilt them: the first moves the part, the second turns it.
+        let faces = form_by(|o, _| u64::from(o.face));
+        let patches = form_by(patch_of);
+        let mut scaled = inverse * self.white_variance(observations, step) + faces + patches;
         for weak in &step.weak {
             scaled += weak * weak.transpose() * self.size_mm.powi(2);
         }

@@ -349,4 +349,8 @@ fn finish<const P: usize, const Q: usize>(
 }
 
 #[cfg(test)]
+#[allow(
+    clippy::print_stdout,
+    reason = "the figures are to be seen with --nocapture"
+)]
 mod tests;
