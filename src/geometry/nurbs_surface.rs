@@ -172,7 +172,7 @@ impl NurbsSurface {
         for i in 0..cells.centres.len() {
             let bound = reach + cells.radii[i];
             let d = d2(i);
-            if d < bound * bound && i != first.0 && cells.is_lowest(i, d, self.closed, d2) {
+            if d < bound * bound && i != first.0 {
                 let found = refine(cells.uv(i));
                 if found.1 < best.1 {
                     best = found;
@@ -300,30 +300,6 @@ impl NurbsSurface {
 impl Cells {
     fn uv(&self, i: usize) -> (f64, f64) {
         (self.u[i / self.v.len()], self.v[i % self.v.len()])
-    }
-
-    /// Whether no neighbour in the grid is nearer.
-    fn is_lowest(&self, i: usize, d: f64, closed: [bool; 2], d2: impl Fn(usize) -> f64) -> bool {
-        let (nu, nv) = (self.u.len() as isize, self.v.len() as isize);
-        let (row, column) = ((i / self.v.len()) as isize, (i % self.v.len()) as isize);
-        for dr in -1..=1 {
-            for dc in -1..=1 {
-                let (mut r, mut c) = (row + dr, column + dc);
-                if closed[0] {
-                    r = r.rem_euclid(nu);
-                }
-                if closed[1] {
-                    c = c.rem_euclid(nv);
-                }
-                if r < 0 || c < 0 || r >= nu || c >= nv {
-                    continue;
-                }
-                if d2((r * nv + c) as usize) < d {
-                    return false;
-                }
-            }
-        }
-        true
     }
 }
 
