@@ -45,10 +45,20 @@ fn views() -> Vec<DVec3> {
 fn rows() -> Vec<Row> {
     let mut rows = vec![
         row("cube", 0.995, || solids::cube(10.0).even(10_250, 580)),
-        row("hole58k", 0.995, || solids::cube_with_hole(10.0).even(58_720, 1_350)),
-        row("hole17k", 0.995, || solids::cube_with_hole(10.0).even(17_400, 839)),
+        row("hole58k", 0.995, || {
+            solids::cube_with_hole(10.0).even(58_720, 1_350)
+        }),
+        row("hole17k", 0.995, || {
+            solids::cube_with_hole(10.0).even(17_400, 839)
+        }),
     ];
-    for (percent, goal) in [(0.4, 0.99), (0.8, 0.98), (1.2, 0.96), (1.6, 0.93), (2.0, 0.90)] {
+    for (percent, goal) in [
+        (0.4, 0.99),
+        (0.8, 0.98),
+        (1.2, 0.96),
+        (1.6, 0.93),
+        (2.0, 0.90),
+    ] {
         rows.push(row(format!("hole17k noise {percent} %"), goal, move || {
             let sampled = solids::cube_with_hole(10.0).even(17_400, 839);
             // Weber's spacing is 0.25 at R = 8.5.
@@ -56,12 +66,20 @@ fn rows() -> Vec<Row> {
             sampled.shaken(radius, 5)
         }));
     }
-    rows.push(row("part500k", 0.96, || solids::block().sample(500_000, 0.1, 1)));
-    rows.push(row("part500k clean", 0.96, || solids::block().sample(500_000, 0.0, 1)));
-    rows.push(row("part500k outliers", 0.94, || {
-        solids::block().sample(500_000, 0.1, 1).with_outliers(0.01, 2)
+    rows.push(row("part500k", 0.96, || {
+        solids::block().sample(500_000, 0.1, 1)
     }));
-    rows.push(row("part100k", 0.96, || solids::block().sample(100_000, 0.1, 1)));
+    rows.push(row("part500k clean", 0.96, || {
+        solids::block().sample(500_000, 0.0, 1)
+    }));
+    rows.push(row("part500k outliers", 0.94, || {
+        solids::block()
+            .sample(500_000, 0.1, 1)
+            .with_outliers(0.01, 2)
+    }));
+    rows.push(row("part100k", 0.96, || {
+        solids::block().sample(100_000, 0.1, 1)
+    }));
     for (ratio, goal) in [(5.0, 0.96), (10.0, 0.95), (20.0, 0.93)] {
         for (what, many) in [("one view", false), ("views", true)] {
             rows.push(row(format!("lines 1:{ratio} {what}"), goal, move || {
@@ -75,7 +93,11 @@ fn rows() -> Vec<Row> {
     }
     for degrees in [20, 25, 30, 40, 60, 90, 120, 140, 150, 160, 165, 170, 172] {
         let angle = f64::from(degrees).to_radians();
-        let goal = if (40..=165).contains(&degrees) { -0.02 } else { -0.08 };
+        let goal = if (40..=165).contains(&degrees) {
+            -0.02
+        } else {
+            -0.08
+        };
         rows.push(row(format!("angle {degrees}"), goal, move || {
             solids::wedge(60.0, angle).sample(7_200, 0.1, 11)
         }));
@@ -113,7 +135,10 @@ fn ratio_f(ratio: f64) -> f64 {
 }
 
 fn main() {
-    let wanted: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
+    let wanted: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|a| !a.starts_with("--"))
+        .collect();
     println!(
         "{:26} {:>8} {:>6} {:>6} {:>6} {:>6} {:>6} {:>7} {:>7} {:>6}",
         "cloud", "points", "goal", "F1", "prec", "recall", "oracle", "s est", "noise/s", "time"
@@ -129,7 +154,11 @@ fn main() {
         let found = detect(&cloud, &neighbors, Method::Adaptive);
         let seconds = start.elapsed().as_secs_f64();
         let best = oracle(&sampled);
-        let goal = if row.goal < 0.0 { best.f1() + row.goal } else { row.goal };
+        let goal = if row.goal < 0.0 {
+            best.f1() + row.goal
+        } else {
+            row.goal
+        };
         let score = score_classes(&sampled, &found.classes);
         println!(
             "{:26} {:8} {:6.3} {:6.3} {:6.3} {:6.3} {:6.3} {:7.3} {:7.3} {:6.2} {}",

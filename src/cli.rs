@@ -1,17 +1,39 @@
 //! The command line: one file a subcommand. Argument parsing only; the work is done by the modules above.
 
 mod check;
+mod demo;
 mod devices;
+mod inspect;
+mod nominal;
+mod progress;
+mod reconstruct;
+mod simulate;
 
 use std::process::ExitCode;
+
+use anyhow::Context;
+
+use crate::report::Report;
+use crate::report::wire;
+use crate::web;
 
 /// What `acies` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
 pub enum Command {
+    /// Play a simulated cell: scan a part with known defects, measure its edges, report.
+    Demo(demo::Demo),
+    /// Measure every sharp edge of a scan against its nominal.
+    Inspect(inspect::Inspect),
+    /// Project a scan onto its surface, keeping edges sharp.
+    Reconstruct(reconstruct::Reconstruct),
+    /// Say what a CAD file holds: faces, edges, sharp edges, and what was refused.
+    Nominal(nominal::Nominals),
     /// Say everything that is wrong with a cell's configuration, touching no device.
     Check(check::Check),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
+    /// Play one simulated device on a pseudo-terminal or a socket.
+    Simulate(simulate::Simulate),
 }
 
 impl Command {
@@ -21,8 +43,13 @@ impl Command {
     /// [`Failure`], whose variant is the exit status.
     pub fn run(self) -> Result<Status, Failure> {
         match self {
+            Command::Demo(command) => command.run(),
+            Command::Inspect(command) => command.run(),
+            Command::Reconstruct(command) => command.run(),
+            Command::Nominal(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),
+            Command::Simulate(command) => command.run(),
         }
     }
 }
@@ -86,4 +113,59 @@ pub(crate) fn print_line(text: &str) -> Result<(), Failure> {
             other.map_err(|error| Failure::Io(anyhow::Error::new(error).context("standard output")))
         }
     }
+}
+
+/// The exit status that a report's verdict asks for. Where nothing was evaluated, there is nothing that is not OK.
+pub(crate) fn status_of(report: &Report) -> Status {
+    match report.verdict {
+        wire::Status::Ok | wire::Status::Undefined => Status::Done,
+        wire::Status::NotOk => Status::NotOk,
+        wire::Status::NotDecidable => Status::NotDecidable,
+    }
+}
+
+/// Serves one report on `address` until the program is interrupted or told to end.
+pub(crate) fn serve_until_interrupted(address: &str, content: web::Content) -> Result<(), Failure> {
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = runtime
+        .context("the page's runtime")
+        .map_err(Failure::Internal)?;
+    runtime.block_on(async {
+        let listener = tokio::net::TcpListener::bind(address)
+            .await
+            .with_context(|| {
+                format!("{address}: cannot listen; choose another address with --serve")
+            })
+            .map_err(Failure::Io)?;
+        let local = listener
+            .local_addr()
+            .context("the page's address")
+            .map_err(Failure::Io)?;
+        let (publisher, pages) = web::pages();
+        publisher.publish(content);
+        eprintln!("page: http://{local}/  (stop with Ctrl-C)");
+        web::serve(listener, pages, interrupted())
+            .await
+            .context("the page")
+            .map_err(Failure::Io)
+    })
+}
+
+/// Ends when the program is interrupted (Ctrl-C) or told to end (SIGTERM), so that ports and pages are given back.
+pub(crate) async fn interrupted() {
+    #[cfg(unix)]
+    {
+        use tokio::signal::unix::{SignalKind, signal};
+        if let Ok(mut terminate) = signal(SignalKind::terminate()) {
+            tokio::select! {
+                _ = tokio::signal::ctrl_c() => {}
+                _ = terminate.recv() => {}
+            }
+            return;
+        }
+    }
+    // Where signals cannot be watched the program still ends by them, only less gently.
+    let _ = tokio::signal::ctrl_c().await;
 }

@@ -11,11 +11,18 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use acies_drivers::device::{Claim, Mistake, Setup};
+use acies_drivers::settings::Keys;
 use glam::DVec3;
 
 use crate::acquire::{Calibration, ScanPlan};
 use crate::geometry::RigidTransform;
-use table::{Lines, TableReader};
+use table::{Lines, pose, vector};
+
+/// A profiler silent for this long has not reached the end of its scan: the slowest stages we know of trigger once a second.
+const SILENCE_S: f64 = 5.0;
+
+/// Counts beyond which nobody's stage goes: a thousand kilometres at a micrometre a count.
+const COUNTS_MAX: i64 = 1_000_000_000_000;
 
 /// A checked cell, ready to start.
 #[derive(Debug)]
@@ -160,6 +167,11 @@ impl Cell {
     }
 }
 
+/// The mistakes of a table that has been read.
+fn problems(keys: Keys) -> Vec<Mistake> {
+    keys.finish().err().unwrap_or_default()
+}
+
 /// A mistake from its three parts.
 fn mistake(key: &str, found: &str, expected: &str) -> Mistake {
     Mistake {
@@ -202,12 +214,12 @@ impl Checker<'_> {
     }
 
     fn cell(&mut self, table: toml::Table) -> Option<Cell> {
-        let mut top = TableReader::new(table);
-        let name = top.string("name");
-        let part = top.table("part");
-        let stage = top.table("stage");
+        let mut top = Keys::new(table);
+        let name = top.needed("name", "a text", Keys::text);
+        let part = top.needed("part", "a table [part]", Keys::table);
+        let stage = top.needed("stage", "a table [stage]", Keys::table);
         let devices = top.tables("device");
-        self.add_all(&[], "", top.finish());
+        self.add_all(&[], "", problems(top));
         let part = part.and_then(|part| self.part(part));
         let stage = stage.and_then(|stage| self.stage(stage));
         let travel_mm_per_count = stage.as_ref().map_or(DVec3::ZERO, |stage| stage.0);
@@ -245,11 +257,15 @@ impl Checker<'_> {
     }
 
     fn part(&mut self, table: toml::Table) -> Option<(PathBuf, Option<PathBuf>, RigidTransform)> {
-        let mut part = TableReader::new(table);
-        let nominal = part.string("nominal");
-        let recipe = part.optional_string("recipe");
-        let pose = part.pose("machine_from_part");
-        let mut mistakes = part.finish();
+        let mut part = Keys::new(table);
+        let nominal = part.needed("nominal", "the name of a CAD file", Keys::text);
+        let recipe = part.text("recipe");
+        let pose = part.needed(
+            "machine_from_part",
+            "a table [part.machine_from_part]",
+            pose,
+        );
+        let mut mistakes = problems(part);
         let mut file = |key: &str, name: Option<String>| {
             let path = self.beside(&name?);
             if !path.is_file() {
@@ -268,11 +284,13 @@ impl Checker<'_> {
     }
 
     fn stage(&mut self, table: toml::Table) -> Option<(DVec3, ScanPlan)> {
-        let mut stage = TableReader::new(table);
-        let travel = stage.vector("travel_mm_per_count");
-        let end_count = stage.integer("end_count");
-        let silence_s = stage.number_or("silence_s", 5.0, 0.1..=600.0);
-        let mut mistakes = stage.finish();
+        let mut stage = Keys::new(table);
+        let travel = vector(&mut stage, "travel_mm_per_count");
+        let end_count = stage.needed("end_count", "a whole number", |keys, key| {
+            keys.integer(key, -COUNTS_MAX..=COUNTS_MAX)
+        });
+        let silence_s = stage.number("silence_s", 0.1..=600.0).unwrap_or(SILENCE_S);
+        let mut mistakes = problems(stage);
         if let Some(travel) = travel.filter(|travel| !(1e-7..=10.0).contains(&travel.length())) {
             let found = format!("{} mm a count", travel.length());
             mistakes.push(mistake(
@@ -297,11 +315,13 @@ impl Checker<'_> {
         table: toml::Table,
         travel_mm_per_count: DVec3,
     ) -> Option<DeviceConfig> {
-        let mut device = TableReader::new(table);
-        let name = device.string("name");
-        let driver = device.string("driver");
-        let calibration = device.optional_pose("calibration");
-        let tip = device.optional_table("tip");
+        let mut device = Keys::new(table);
+        let name = device.needed("name", "a text", Keys::text);
+        let driver = device.needed("driver", "the word of a driver", Keys::text);
+        let calibration = device
+            .contains("calibration")
+            .then(|| pose(&mut device, "calibration"));
+        let tip = device.table("tip");
         let touches = device.tables("touch");
         let place = name
             .as_ref()
@@ -378,11 +398,15 @@ impl Checker<'_> {
     }
 
     fn tip(&mut self, at: &[&str], place: &str, table: toml::Table) -> Option<(f64, f64)> {
-        let mut tip = TableReader::new(table);
-        let radius_mm = tip.number("radius_mm", 0.05..=25.0);
-        let u_touch_mm = tip.number("u_touch_mm", 1e-5..=1.0);
+        let mut tip = Keys::new(table);
+        let radius_mm = tip.needed("radius_mm", "a number, mm", |keys, key| {
+            keys.number(key, 0.05..=25.0)
+        });
+        let u_touch_mm = tip.needed("u_touch_mm", "a number, mm", |keys, key| {
+            keys.number(key, 1e-5..=1.0)
+        });
         let path: Vec<&str> = at.iter().copied().chain(["tip"]).collect();
-        self.add_all(&path, &format!("{place}, tip"), tip.finish());
+        self.add_all(&path, &format!("{place}, tip"), problems(tip));
         Some((radius_mm?, u_touch_mm?))
     }
 
@@ -393,10 +417,10 @@ impl Checker<'_> {
         index: usize,
         table: toml::Table,
     ) -> Option<PlannedTouch> {
-        let mut touch = TableReader::new(table);
-        let start_mm = touch.vector("start_mm");
-        let target_mm = touch.vector("target_mm");
-        let mut mistakes = touch.finish();
+        let mut touch = Keys::new(table);
+        let start_mm = vector(&mut touch, "start_mm");
+        let target_mm = vector(&mut touch, "target_mm");
+        let mut mistakes = problems(touch);
         if let (Some(start), Some(target)) = (start_mm, target_mm)
             && start.distance(target) < 0.1
         {

@@ -10,6 +10,7 @@ use crate::points::{Neighbors, PointCloud, Spacing, noise_mm, spacing};
 mod adaptive;
 mod flanks;
 mod patch;
+pub mod profile;
 mod tangent;
 
 use adaptive::{Places, Sights};
@@ -87,7 +88,12 @@ pub fn detect(cloud: &PointCloud, neighbors: &Neighbors, method: Method) -> Dete
     detection
 }
 
-fn adaptive(cloud: &PointCloud, neighbors: &Neighbors, detection: &mut Detection, clock: &mut Clock) {
+fn adaptive(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    detection: &mut Detection,
+    clock: &mut Clock,
+) {
     let places = Places {
         positions: neighbors
             .places()

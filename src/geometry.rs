@@ -1,5 +1,19 @@
 //! Rigid transforms, fits with residuals and covariance, NURBS curves and surfaces.
 
+pub mod basis;
+pub mod curve;
+pub mod fit;
+pub mod frame;
+pub mod newton;
+pub mod nurbs_curve;
+pub mod nurbs_surface;
 pub mod rigid;
+pub mod surface;
+pub mod sweep;
 
+pub use curve::Curve;
+pub use frame::Frame;
+pub use nurbs_curve::NurbsCurve;
+pub use nurbs_surface::NurbsSurface;
 pub use rigid::RigidTransform;
+pub use surface::Surface;

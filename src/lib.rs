@@ -10,12 +10,20 @@ pub mod geometry;
 
 pub mod features;
 
+pub mod surface;
+
 pub mod nominal;
 
 pub mod inspect;
 
+pub mod report;
+
 pub mod acquire;
 
 pub mod config;
+
+pub mod cell;
+
+pub mod web;
 
 pub mod cli;

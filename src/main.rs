@@ -4,7 +4,9 @@ use std::process::ExitCode;
 
 use acies::cli::{Command, Failure};
 use clap::Parser;
-use tracing_subscriber::EnvFilter;
+use tracing_subscriber::filter::Targets;
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::util::SubscriberInitExt;
 
 /// Finds the sharp edges of a scanned part and measures each against its nominal NURBS edge.
 ///
@@ -39,10 +41,15 @@ fn main() -> ExitCode {
             };
         }
     };
-    let filter = EnvFilter::try_new(&arguments.log).unwrap_or_else(|_| EnvFilter::new("warn"));
-    tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
+    let Ok(filter) = arguments.log.parse::<Targets>() else {
+        let log = &arguments.log;
+        eprintln!("acies: --log {log:?} is no level; expected one such as info, or acies=debug");
+        return ExitCode::from(64);
+    };
+    let to_standard_error = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    tracing_subscriber::registry()
+        .with(filter)
+        .with(to_standard_error)
         .init();
     match arguments.command.run() {
         Ok(status) => status.into(),

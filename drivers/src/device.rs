@@ -12,8 +12,11 @@ pub struct Driver {
     /// What it is, for people.
     pub summary: &'static str,
     /// Checks one `[[device]]` table without its `name` and `driver`. No effects; all mistakes at once.
-    pub configure: fn(toml::Table) -> Result<Box<dyn Setup>, Vec<Mistake>>,
+    pub configure: fn(toml::Table) -> Configured,
 }
+
+/// A checked configuration, or everything wrong with it.
+pub type Configured = Result<Box<dyn Setup>, Vec<Mistake>>;
 
 /// Something wrong in a configuration table.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -79,6 +82,9 @@ pub struct Identity {
 }
 
 /// What was lost on the way, since the run started. Nothing is lost silently.
+///
+/// After [`Profiler::stop`], `received + lost_on_link` is the number of profiles that the device sent. `rejected` and
+/// `skipped_bytes` tell why some of them are missing, and are no further losses.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Losses {
     /// Profiles received whole.
@@ -102,15 +108,18 @@ pub trait Profiler: Send {
     /// # Errors
     /// When the device refuses or does not answer; the laser is then off.
     fn start(&mut self) -> Result<(), crate::error::DeviceError>;
-    /// Waits for the next profile until `deadline`; `None` when it passed, or when the run ended by itself.
+    /// Waits for the next profile until `deadline`; `None` when it passed.
+    ///
+    /// A caller that stays away for longer than the driver says lets the run end, so that a laser does not stay on for nobody.
     ///
     /// # Errors
-    /// When the device is gone; reopening is the caller's decision.
+    /// When the device is gone or ended the run by itself, after the last profile that came; reopening is the caller's decision.
     fn next(&mut self, deadline: Instant) -> Result<Option<Profile>, crate::error::DeviceError>;
     /// Ends the run: laser off. Profiles still under way are returned, so that nothing sent is lost.
     ///
     /// # Errors
-    /// When the device does not confirm; it then stops by its own keep-alive.
+    /// When the device does not confirm; it then stops by its own keep-alive. Profiles that came are then left to
+    /// [`Profiler::next`].
     fn stop(&mut self) -> Result<Vec<Profile>, crate::error::DeviceError>;
     /// What was lost since [`Profiler::start`].
     fn losses(&self) -> Losses;

@@ -2,13 +2,18 @@
 //!
 //! In reading order: [`capture`] (what instruments deliver), [`device`] (the driver contract), [`link`] (bytes to and from a
 //! device, recorded and replayed), then one file a driver. To add one: write `<model>.rs`, add a line to [`ALL`].
+//! [`attached`] lists what is plugged in.
 
 #![forbid(unsafe_code)]
 
+pub mod attached;
 pub mod capture;
 pub mod device;
 pub mod error;
+pub mod grbl_probe;
 pub mod link;
+pub mod open_profile;
+pub mod settings;
 
 /// Every driver, in the order shown to people.
-pub static ALL: &[device::Driver] = &[];
+pub static ALL: &[device::Driver] = &[open_profile::DRIVER, grbl_probe::DRIVER];

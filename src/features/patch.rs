@@ -203,7 +203,11 @@ fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; 
 pub(super) fn foot(one: &Surface, other: &Surface, start: DVec3) -> Option<(DVec3, DVec3)> {
     let mut at = start;
     let mut tangent = DVec3::ZERO;
-    let rounds = if one.is_curved() || other.is_curved() { 6 } else { 2 };
+    let rounds = if one.is_curved() || other.is_curved() {
+        6
+    } else {
+        2
+    };
     for _ in 0..rounds {
         let ((h1, g1), (h2, g2)) = (one.height(at), other.height(at));
         let (h1, g1) = (h1 / g1.length(), g1.normalize());

@@ -2,8 +2,10 @@
 
 use glam::DVec3;
 
+use crate::features::Class;
 use crate::geometry::RigidTransform;
 use crate::nominal::{EdgeKind, Station};
+use crate::points::Spacing;
 
 /// The answer of a value, an edge or a part. The worst rules upward, in this order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -35,6 +37,19 @@ pub struct Inspection {
     pub seconds: Vec<(&'static str, f64)>,
     /// What was wrong with the data; the result goes on.
     pub findings: Vec<String>,
+    /// What the scan is like and which of its points lie on edges; `None` where nothing was estimated.
+    pub scan: Option<ScanEstimate>,
+}
+
+/// What was estimated from the scan itself.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ScanEstimate {
+    /// Along and across the lines, and their mean.
+    pub spacing: Spacing,
+    /// Standard deviation of the points normal to the surface, mm.
+    pub noise_mm: f64,
+    /// N classes, in the order of the cloud.
+    pub classes: Vec<Class>,
 }
 
 /// How the scan lies in the part frame, and how well that is known.

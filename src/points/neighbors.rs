@@ -234,7 +234,10 @@ mod tests {
         let neighbors = Neighbors::new(&points);
         let mut found = Vec::new();
         neighbors.nearest(points[7], 5, &mut found);
-        assert_eq!(found.iter().map(|f| f.0).collect::<Vec<_>>(), [0, 1_000_000]);
+        assert_eq!(
+            found.iter().map(|f| f.0).collect::<Vec<_>>(),
+            [0, 1_000_000]
+        );
         assert_eq!(neighbors.order().len(), points.len());
     }
 
@@ -245,7 +248,9 @@ mod tests {
         none.nearest(DVec3::ZERO, 3, &mut found);
         assert!(found.is_empty());
 
-        let line: Vec<DVec3> = (0..5_000).map(|i| DVec3::new(f64::from(i), 0.0, 0.0)).collect();
+        let line: Vec<DVec3> = (0..5_000)
+            .map(|i| DVec3::new(f64::from(i), 0.0, 0.0))
+            .collect();
         Neighbors::new(&line).nearest(line[2_500], 3, &mut found);
         assert_eq!(found.len(), 3);
         assert_eq!(found[0].0, 2_500);

@@ -148,15 +148,11 @@ fn quadric_variance(
     for (i, _) in &found {
         let d = (cloud.positions[*i as usize] - p - plane.centre) / reach;
         let (x, y) = (d.dot(plane.major), d.dot(v));
-        for (column, value) in columns.iter_mut().zip([
-            1.0,
-            x,
-            y,
-            x * x,
-            x * y,
-            y * y,
-            d.dot(plane.normal),
-        ]) {
+        for (column, value) in
+            columns
+                .iter_mut()
+                .zip([1.0, x, y, x * x, x * y, y * y, d.dot(plane.normal)])
+        {
             column.push(value);
         }
     }

@@ -248,7 +248,10 @@ impl Face {
                 continue;
             }
             let (z, flat) = (dz + az * t, df + af * t);
-            let angle = flat.dot(up.cross(*start)).atan2(flat.dot(*start)).rem_euclid(TAU);
+            let angle = flat
+                .dot(up.cross(*start))
+                .atan2(flat.dot(*start))
+                .rem_euclid(TAU);
             let inside = (0.0..=height).contains(&z) && angle <= *sweep && rd + ra * t >= 0.0;
             if inside && found.is_none_or(|f| t < f.0) {
                 found = Some((t, (flat.normalize_or_zero() - up * slope).normalize()));
@@ -355,7 +358,13 @@ impl Solid {
 
     /// Scan by parallel rays from each of `views` (unit vectors towards the sensor): lines `across` apart, points `along` apart on
     /// them, noise along the ray. A surface seen at less than ten degrees gives no point.
-    pub fn scan(&self, views: &[DVec3], (along, across): (f64, f64), noise: f64, seed: u64) -> Sampled {
+    pub fn scan(
+        &self,
+        views: &[DVec3],
+        (along, across): (f64, f64),
+        noise: f64,
+        seed: u64,
+    ) -> Sampled {
         let mut random = Random::new(seed);
         let mut points = Vec::new();
         let reach: f64 = 4.0 * self.radius();
@@ -366,7 +375,8 @@ impl Solid {
             let columns = (0.5 * reach / along) as i64;
             for line in -half..half {
                 for column in -columns..columns {
-                    let place = u * (column as f64 + 0.137) * along + v * (line as f64 + 0.291) * across;
+                    let place =
+                        u * (column as f64 + 0.137) * along + v * (line as f64 + 0.291) * across;
                     let from = place + *towards * reach;
                     let ray = -*towards;
                     let nearest = self
@@ -416,8 +426,16 @@ impl Sampled {
     /// With the share `share` of points uniform in the bounding box added.
     pub fn with_outliers(mut self, share: f64, seed: u64) -> Self {
         let mut random = Random::new(seed);
-        let low = self.points.iter().copied().fold(DVec3::INFINITY, DVec3::min);
-        let high = self.points.iter().copied().fold(DVec3::NEG_INFINITY, DVec3::max);
+        let low = self
+            .points
+            .iter()
+            .copied()
+            .fold(DVec3::INFINITY, DVec3::min);
+        let high = self
+            .points
+            .iter()
+            .copied()
+            .fold(DVec3::NEG_INFINITY, DVec3::max);
         for _ in 0..(self.points.len() as f64 * share) as usize {
             let r = DVec3::new(random.unit(), random.unit(), random.unit());
             self.points.push(low + (high - low) * r);

@@ -39,7 +39,10 @@ pub fn is_edge(class: &Class) -> bool {
 
 /// Distance to the nearest of the lines.
 pub fn distance(lines: &[Line], p: DVec3) -> f64 {
-    lines.iter().map(|l| l.distance(p)).fold(f64::INFINITY, f64::min)
+    lines
+        .iter()
+        .map(|l| l.distance(p))
+        .fold(f64::INFINITY, f64::min)
 }
 
 /// The score of the points for which `found` holds.
@@ -52,12 +55,20 @@ pub fn score(sampled: &Sampled, found: &[bool]) -> Score {
         .map(|(p, _)| *p)
         .collect();
     let s = sampled.spacing;
-    let good = detected.iter().filter(|p| distance(&sampled.edges, **p) <= s * (1.0 + 1e-9)).count();
+    let good = detected
+        .iter()
+        .filter(|p| distance(&sampled.edges, **p) <= s * (1.0 + 1e-9))
+        .count();
     let recall = if sampled.on_edge.is_empty() {
         length_recall(sampled, &detected)
     } else {
         let on_edge = sampled.on_edge.iter().filter(|o| **o).count();
-        let hit = sampled.on_edge.iter().zip(found).filter(|(o, f)| **o && **f).count();
+        let hit = sampled
+            .on_edge
+            .iter()
+            .zip(found)
+            .filter(|(o, f)| **o && **f)
+            .count();
         hit as f64 / on_edge as f64
     };
     Score {

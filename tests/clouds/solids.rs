@@ -75,7 +75,9 @@ fn add_hole(solid: &mut Solid, hole: &Hole) {
         sweep: TAU,
     });
     for centre in [base, base + axis] {
-        solid.edges.push(Line::Arc(centre, DVec3::Z, DVec3::X * hole.radius, TAU));
+        solid
+            .edges
+            .push(Line::Arc(centre, DVec3::Z, DVec3::X * hole.radius, TAU));
     }
     if hole.blind {
         solid.faces.push(Face::Round {
@@ -207,7 +209,16 @@ pub fn ribs(thicknesses: &[f64]) -> Solid {
     profile.push(DVec2::new(end, 20.0));
     let mut x = end;
     for t in thicknesses {
-        for (dx, z) in [(gap, 20.0), (0.0, 40.0), (*t, 40.0), (0.0, 20.0), (gap, 20.0), (0.0, 10.0), (*t, 10.0), (0.0, 20.0)] {
+        for (dx, z) in [
+            (gap, 20.0),
+            (0.0, 40.0),
+            (*t, 40.0),
+            (0.0, 20.0),
+            (gap, 20.0),
+            (0.0, 10.0),
+            (*t, 10.0),
+            (0.0, 20.0),
+        ] {
             x -= dx;
             profile.push(DVec2::new(x, z));
         }
@@ -258,7 +269,12 @@ pub fn cylinder(radius: f64, height: f64) -> Solid {
         radii: (0.0, radius),
         sweep: TAU,
     });
-    solid.edges.push(Line::Arc(DVec3::Z * (0.5 * height), DVec3::Z, DVec3::X * radius, TAU));
+    solid.edges.push(Line::Arc(
+        DVec3::Z * (0.5 * height),
+        DVec3::Z,
+        DVec3::X * radius,
+        TAU,
+    ));
     solid
 }
 
@@ -289,8 +305,12 @@ pub fn rounded_bar(radius: f64) -> Solid {
         });
         for z in [0.0, length] {
             let up = DVec3::Z * z;
-            solid.borders.push(Line::Arc(base + up, DVec3::Z, x * radius, 0.5 * PI));
-            solid.borders.push(Line::Segment(origin + up, origin + up + y * w));
+            solid
+                .borders
+                .push(Line::Arc(base + up, DVec3::Z, x * radius, 0.5 * PI));
+            solid
+                .borders
+                .push(Line::Segment(origin + up, origin + up + y * w));
         }
     }
     solid

@@ -1,0 +1,127 @@
+//! Reconstruction on bodies whose surface is known: distances, normals and times, beside what other programs reach.
+//!
+//! `cargo bench --bench reconstruction` prints the tables; `-- quick` leaves out the large clouds.
+
+#![allow(clippy::print_stdout)]
+
+#[path = "../tests/surface/figures.rs"]
+mod figures;
+#[path = "../tests/surface/truth.rs"]
+mod truth;
+
+use acies::surface::Settings;
+use figures::Trial;
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let quick = arguments.iter().any(|a| a == "quick");
+    let mut trials = vec![
+        figures::cube_trial(52, 0.0),
+        figures::cube_trial(52, 0.8),
+        figures::cube_trial(52, 2.0),
+        figures::block_trial(if quick { 60_000 } else { 500_000 }),
+        figures::lines_trial(if quick { 1.5 } else { 0.6 }),
+    ];
+    if arguments.iter().any(|a| a == "hard") {
+        trials.clear();
+        for angle in [172.0, 165.0, 150.0, 120.0, 60.0, 40.0, 25.0] {
+            trials.push(figures::body_trial(
+                &format!("ridge {angle}"),
+                truth::ridge(angle),
+                8_000,
+                0.1,
+            ));
+        }
+        for gap in [0.3, 0.6, 1.0, 2.0] {
+            let unit = (800.0f64 / 8_000.0).sqrt();
+            trials.push(figures::body_trial(
+                &format!("plates {gap}"),
+                truth::plates(gap * unit),
+                8_000,
+                0.05,
+            ));
+        }
+        for width in [2.0, 4.0, 6.0] {
+            let unit = 0.25;
+            trials.push(figures::body_trial(
+                &format!("slot {width}"),
+                truth::slot(width * unit, width * unit),
+                8_000,
+                0.1,
+            ));
+        }
+        trials.push(figures::body_trial(
+            "block clean",
+            truth::stepped_block(),
+            60_000,
+            0.0,
+        ));
+        trials.push(figures::body_trial(
+            "block 0.3",
+            truth::stepped_block(),
+            60_000,
+            0.3,
+        ));
+        trials.push(figures::body_trial(
+            "block coarse",
+            truth::stepped_block(),
+            4_000,
+            0.1,
+        ));
+    }
+    if let Some(only) = arguments.iter().find_map(|a| a.strip_prefix("only=")) {
+        trials.retain(|t| t.name.contains(only));
+    }
+    println!(
+        "{:<34}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>7}{:>7}{:>7}{:>8}{:>8}{:>7}{:>8}",
+        "cloud",
+        "in flat",
+        "in edge",
+        "flat",
+        "edge",
+        "gap own",
+        "gap",
+        "worst",
+        "proj",
+        "n flat",
+        "n edge",
+        "n meas",
+        "line",
+        "l worst",
+        "lines",
+        "seconds"
+    );
+    for trial in &trials {
+        row(trial);
+    }
+}
+
+fn row(trial: &Trial) {
+    let cloud = figures::cloud_of(&trial.seen);
+    let neighbors = acies::points::Neighbors::new(&cloud.positions);
+    let start = std::time::Instant::now();
+    let result = acies::surface::reconstruct(&cloud, &neighbors, Settings::default())
+        .expect("enough points");
+    let seconds = start.elapsed().as_secs_f64();
+    let f = trial.figures(&result);
+    println!(
+        "{:<34}{:>8.4}{:>8.4}{:>8.4}{:>8.4}{:>8.3}{:>8.3}{:>8.3}{:>8.4}{:>7.2}{:>7.2}{:>7.2}{:>8.4}{:>8.3}{:>7}{:>8.2}   {:?}",
+        trial.name,
+        f.input_flat,
+        f.input_edge,
+        f.flat,
+        f.edge,
+        f.edge_gap_own,
+        f.edge_gap,
+        f.worst,
+        f.projected,
+        f.normal_flat,
+        f.normal_edge,
+        f.normal_edge_measured,
+        f.line_rms,
+        f.line_worst,
+        f.lines,
+        seconds,
+        result.scale
+    );
+}

@@ -1,0 +1,200 @@
+//! `acies demo`: a simulated cell scans a part with known defects, reports, and serves the page where asked.
+
+use std::fs;
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use acies_drivers::link::cable::Cable;
+use acies_simulators::demo_cell::{DemoCell, DemoOptions};
+use acies_simulators::demo_part::Defects;
+use acies_simulators::faults::Faults;
+use anyhow::{Context, anyhow};
+
+use super::progress::CellProgress;
+use super::{Failure, Status, print_line, status_of};
+use crate::cell::{self, CellError, Outcome};
+use crate::config::Cell;
+use crate::points::write_scan;
+use crate::report::{DeviceFacts, Facts, Report, ScanFacts, print_table, to_ply};
+use crate::web;
+
+/// What the demo's folder holds before the first scan.
+const FILES: [(&str, &str); 3] = [
+    ("cell.toml", include_str!("../../configs/demo/cell.toml")),
+    (
+        "recipe.toml",
+        include_str!("../../configs/demo/recipe.toml"),
+    ),
+    ("part.step", include_str!("../../configs/demo/part.step")),
+];
+
+/// Plays a whole cell: two laser profilers on a stage, a touch probe, and a part with known defects.
+///
+/// The devices speak their real protocols on pseudo-terminals; everything in the report follows from their bytes. The part is
+/// faulty on purpose (a wall 60 um off, a face tilted by 0.25 degrees, a boss 30 um too large, a chamfer of 0.4 mm, a stretch the
+/// lasers cannot see), so the verdict is not OK and the exit status 1.
+#[derive(Debug, clap::Args)]
+pub struct Demo {
+    /// Folder for the cell's files and the report.
+    #[arg(short, long, value_name = "FOLDER", default_value = "acies-demo")]
+    output: PathBuf,
+    /// Seed of the part's place, the noise and the faults: the same seed gives the same bytes.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// A part as drawn, without defects.
+    #[arg(long)]
+    perfect: bool,
+    /// What goes wrong at the profilers, as in "unplug-after=100": see `acies simulate --help`.
+    #[arg(long, value_name = "FAULTS")]
+    faults: Option<Faults>,
+    /// Scan in real time, as the instruments would.
+    #[arg(long)]
+    paced: bool,
+    /// Stay, and show the report's page on this address.
+    #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = "127.0.0.1:8370")]
+    serve: Option<String>,
+    /// Print the report as one JSON object on standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Demo {
+    /// Carries the command out.
+    ///
+    /// # Errors
+    /// When the folder cannot be written or a simulated device does not start.
+    pub fn run(self) -> Result<Status, Failure> {
+        let (outcome, report) = self.inspect()?;
+        let scan_ply = self.write(&outcome, &report)?;
+        if self.json {
+            print_line(&report.to_json())?;
+        } else {
+            self.show(&outcome, &report)?;
+        }
+        if let Some(address) = &self.serve {
+            let content = web::Content::new(&report, Some(scan_ply));
+            super::serve_until_interrupted(address, content)?;
+        }
+        Ok(status_of(&report))
+    }
+
+    /// Sets the cell up in its folder, plays its devices and runs the job.
+    fn inspect(&self) -> Result<(Outcome, Report), Failure> {
+        let ports = self.output.join("dev");
+        fs::create_dir_all(&ports).map_err(|error| writing(error, &ports))?;
+        for (name, text) in FILES {
+            let path = self.output.join(name);
+            fs::write(&path, text).map_err(|error| writing(error, &path))?;
+        }
+        let mut options = DemoOptions {
+            paced: self.paced,
+            ..DemoOptions::new(self.seed)
+        };
+        if self.perfect {
+            options.defects = Defects::none();
+        }
+        options.faults = self.faults.clone().unwrap_or_default();
+        let playing = DemoCell::with_options(options).start(&ports);
+        let _playing = playing
+            .context("the simulated devices")
+            .map_err(Failure::Io)?;
+
+        let cell = Cell::read(&self.output.join("cell.toml"))
+            .map_err(|errors| Failure::Internal(anyhow!("the demo's own cell\n{errors}")))?;
+        let mut progress = CellProgress::new();
+        let outcome = cell::run(&cell, &Cable, &mut |state| progress.tell(&state));
+        progress.finish();
+        let outcome = outcome.map_err(failure_of)?;
+        let report = Report::new(&outcome.inspection, &facts(&outcome, self.seed));
+        Ok((outcome, report))
+    }
+
+    /// The report in its forms and the scan; returns the coloured scan.
+    fn write(&self, outcome: &Outcome, report: &Report) -> Result<Vec<u8>, Failure> {
+        for name in ["report.json", "report.html", "report.csv"] {
+            let written = report.write_atomically(&self.output.join(name));
+            written.map_err(|error| Failure::Io(error.into()))?;
+        }
+        let cloud = &outcome.scan.cloud;
+        write_scan(&self.output.join("scan.ply"), cloud)
+            .map_err(|error| Failure::Io(error.into()))?;
+        let classes = outcome
+            .inspection
+            .scan
+            .iter()
+            .flat_map(|scan| &scan.classes);
+        let features: Vec<u8> = classes.map(|&class| class as u8).collect();
+        let coloured = to_ply(cloud, &features).map_err(|error| Failure::Internal(error.into()))?;
+        let path = self.output.join("edges.ply");
+        crate::points::write::write_atomically(&path, &coloured)
+            .map_err(|error| Failure::Io(error.into()))?;
+        Ok(coloured)
+    }
+
+    fn show(&self, outcome: &Outcome, report: &Report) -> Result<(), Failure> {
+        print_line(&print_table(report, std::io::stdout().is_terminal()))?;
+        let views = &outcome.scan.views;
+        let profiles: u64 = views.iter().map(|view| view.losses.received).sum();
+        let lost: u64 = views
+            .iter()
+            .map(|view| view.losses.lost_on_link + view.losses.dropped_by_device)
+            .sum();
+        print_line(&format!(
+            "{profiles} profiles in {:.2} s ({:.0} a second), {lost} lost; verdict {:.2} s after the last profile",
+            outcome.scan_seconds,
+            profiles as f64 / outcome.scan_seconds,
+            outcome.verdict_seconds
+        ))?;
+        let folder = self.output.display();
+        print_line(&format!(
+            "report: {folder}/report.html  (also .json, .csv; scan.ply, edges.ply)"
+        ))
+    }
+}
+
+fn writing(error: std::io::Error, path: &Path) -> Failure {
+    let what = format!(
+        "{}: cannot be written; choose another folder with --output",
+        path.display()
+    );
+    Failure::Io(anyhow::Error::new(error).context(what))
+}
+
+fn failure_of(error: CellError) -> Failure {
+    match &error {
+        CellError::Nominal(_) | CellError::Recipe { .. } => Failure::BadInput(error.into()),
+        CellError::Kind { .. } => Failure::BadInput(error.into()),
+        _ => Failure::Io(error.into()),
+    }
+}
+
+/// What the report says beside what was found.
+fn facts(outcome: &Outcome, seed: u64) -> Facts {
+    let scan = outcome.inspection.scan.as_ref();
+    let profilers = outcome.scan.views.iter().map(|view| DeviceFacts {
+        name: view.device.clone(),
+        identity: view.identity.clone(),
+        losses: Some(view.losses),
+    });
+    let probes = outcome.probes.iter().map(|(name, identity)| DeviceFacts {
+        name: name.clone(),
+        identity: identity.clone(),
+        losses: None,
+    });
+    Facts {
+        part: outcome.nominal.name.clone(),
+        nominal: "part.step".to_owned(),
+        created: SystemTime::now(),
+        simulated_seed: Some(seed),
+        scan: ScanFacts {
+            points: outcome.scan.cloud.len(),
+            spacing_mm: scan.map(|scan| scan.spacing.mean_mm),
+            spacing_along_line_mm: scan.map(|scan| scan.spacing.along_mm),
+            spacing_across_lines_mm: scan.map(|scan| scan.spacing.across_mm),
+            noise_mm: scan.map(|scan| scan.noise_mm),
+        },
+        devices: profilers.chain(probes).collect(),
+        recipe: outcome.recipe.clone(),
+    }
+}

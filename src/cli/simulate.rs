@@ -1,0 +1,70 @@
+//! `acies simulate DEVICE`: one simulated device on a pseudo-terminal or a socket.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use acies_simulators::devices::{self, Place, StartError};
+use anyhow::Context;
+
+use super::{Failure, Status, print_line};
+
+/// Plays one device of the demo's cell until it is interrupted, so that a host can be tried without hardware.
+///
+/// It speaks its real protocol, in real time, about the demo's part. The port is printed on standard output once it is there.
+#[derive(Debug, clap::Args)]
+#[command(after_help = AFTER)]
+pub struct Simulate {
+    /// Which device: open-profile, open-profile-right or grbl-probe.
+    device: String,
+    /// Path under which the pseudo-terminal appears.
+    #[arg(long, value_name = "PATH", conflicts_with = "tcp")]
+    port: Option<PathBuf>,
+    /// Listen on this address instead, as in 127.0.0.1:7450.
+    #[arg(long, value_name = "ADDRESS")]
+    tcp: Option<SocketAddr>,
+    /// Seed of noise, place and faults.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// What goes wrong, as in "lose=1e-4,unplug-after=100,replug-ms=500".
+    #[arg(long, default_value = "", value_name = "FAULTS")]
+    faults: String,
+}
+
+const AFTER: &str = "Faults, separated by commas (P is a probability, N counts profiles or probing moves):
+  lose=P lose-frame=P flip=P lie=P babble=P split lumps   on the wire: bytes and frames lost, changed, invented
+  drop=P duplicate=P jump=N:COUNTS                        profiles dropped or doubled, encoder jumps
+  silent-after=N reboot-after=N unplug-after=N replug-ms=M
+  no-contact damage-prb=N alarm reset-in-move=N           the probe's";
+
+impl Simulate {
+    /// Carries the command out.
+    ///
+    /// # Errors
+    /// Wrong usage where device or faults are unknown; input or output where the port cannot be taken.
+    pub fn run(self) -> Result<Status, Failure> {
+        let default_port = || PathBuf::from(format!("tty-{}", self.device));
+        let place = match self.tcp {
+            Some(address) => Place::Tcp(address),
+            None => Place::Pty(self.port.clone().unwrap_or_else(default_port)),
+        };
+        let device = devices::start(&self.device, &place, self.seed, &self.faults);
+        let device = device.map_err(|error| match error {
+            StartError::Port { .. } => Failure::Io(error.into()),
+            _ => Failure::Usage(error.into()),
+        })?;
+        print_line(device.port())?;
+        eprintln!(
+            "{} plays on {} (stop with Ctrl-C)",
+            self.device,
+            device.port()
+        );
+        let runtime = tokio::runtime::Builder::new_current_thread()
+            .enable_all()
+            .build();
+        let runtime = runtime
+            .context("the simulator's runtime")
+            .map_err(Failure::Internal)?;
+        runtime.block_on(super::interrupted());
+        Ok(Status::Done)
+    }
+}

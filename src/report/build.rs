@@ -1,0 +1,371 @@
+//! From what an inspection found to the wire types: units changed, nothing that is not finite let through.
+
+use std::f64::consts::PI;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use glam::DVec3;
+
+use super::Facts;
+use super::characteristic::{Criterion, characteristic, samples, spread};
+use super::conclusion;
+use super::wire::{self, Quantity, Report, Status};
+use crate::inspect::recipe::{EdgeKey, Limits, Recipe, Rule};
+use crate::inspect::result::{Alignment, EdgeResult, Inspection, StationResult, Verdict};
+use crate::nominal::EdgeKind;
+
+impl Report {
+    /// The report of `inspection`, with `facts` beside it.
+    ///
+    /// Numbers that are not finite become `null`. Where that hits a measured value, its station says so in `reason` and is at
+    /// best not decidable, and so are its edge and the part.
+    pub fn new(inspection: &Inspection, facts: &Facts) -> Self {
+        let mut findings = inspection.findings.clone();
+        let edges: Vec<_> = inspection
+            .edges
+            .iter()
+            .enumerate()
+            .map(|(index, edge)| {
+                let limits = limits_of(&facts.recipe, index, edge);
+                let rule = facts.recipe.rule;
+                edge_from_result(edge, (&limits, rule), &mut findings)
+            })
+            .collect();
+        let alignment = alignment_from_result(&inspection.alignment);
+        // A good alignment makes no part OK: where no value was judged, nothing was.
+        let beside_the_edges = [status_from_verdict(inspection.verdict), alignment.status]
+            .into_iter()
+            .filter(|status| *status > Status::Ok);
+        let verdict = edges
+            .iter()
+            .map(|edge| edge.verdict)
+            .chain(beside_the_edges)
+            .max()
+            .unwrap_or(Status::Undefined);
+        let mut report = Report {
+            schema: wire::Schema::V1,
+            part: facts.part.clone(),
+            nominal: facts.nominal.clone(),
+            created: rfc3339(facts.created),
+            software: wire::Software {
+                name: "acies".to_owned(),
+                version: env!("CARGO_PKG_VERSION").to_owned(),
+            },
+            simulated: facts.simulated_seed.is_some(),
+            seed: facts.simulated_seed,
+            verdict,
+            reason: String::new(),
+            advice: String::new(),
+            recipe: recipe_on_the_wire(&facts.recipe),
+            scan: scan_from_facts(facts),
+            devices: devices_from_facts(facts),
+            alignment,
+            edges,
+            unexpected_edges: inspection
+                .unexpected_edges
+                .iter()
+                .map(|line| line.iter().copied().filter_map(xyz).collect())
+                .collect(),
+            missing_edges: inspection.missing_edges.clone(),
+            findings,
+            seconds: seconds_by_stage(&inspection.seconds),
+        };
+        (report.reason, report.advice) = conclusion::conclude(&report);
+        report
+    }
+}
+
+/// Times outside 1970 to 9999 are clamped: no clock shows them, and RFC 3339 cannot write them.
+fn rfc3339(time: SystemTime) -> String {
+    let end_of_9999 = UNIX_EPOCH + Duration::from_secs(253_402_300_799);
+    humantime::format_rfc3339_seconds(time.clamp(UNIX_EPOCH, end_of_9999)).to_string()
+}
+
+/// Beyond this (a thousand kilometres in mm) a number is as useless as infinity, and squares of it would overflow later.
+const LARGEST: f64 = 1e9;
+
+fn finite(value: f64) -> Option<f64> {
+    (value.abs() <= LARGEST).then_some(value)
+}
+
+fn degrees(angle_rad: f64) -> Option<f64> {
+    finite(angle_rad.to_degrees())
+}
+
+fn xyz(v: DVec3) -> Option<wire::Xyz> {
+    let [x, y, z] = v.to_array().map(finite);
+    Some([x?, y?, z?])
+}
+
+fn status_from_verdict(verdict: Verdict) -> Status {
+    match verdict {
+        Verdict::Undefined => Status::Undefined,
+        Verdict::Ok => Status::Ok,
+        Verdict::NotDecidable => Status::NotDecidable,
+        Verdict::NotOk => Status::NotOk,
+    }
+}
+
+/// A stage that comes twice (a second view) is summed.
+fn seconds_by_stage(seconds: &[(&'static str, f64)]) -> indexmap::IndexMap<String, f64> {
+    let mut by_stage = indexmap::IndexMap::new();
+    for &(stage, seconds) in seconds.iter().filter(|(_, seconds)| seconds.is_finite()) {
+        *by_stage.entry(stage.to_owned()).or_insert(0.0) += seconds;
+    }
+    by_stage
+}
+
+fn recipe_on_the_wire(recipe: &Recipe) -> wire::Recipe {
+    let (rule, guard_band_k) = match recipe.rule {
+        Rule::Simple => (wire::Rule::Simple, None),
+        Rule::GuardBand(k) => (wire::Rule::GuardBand, finite(k)),
+    };
+    let [d1_mm, d2_mm] = recipe.limits.d_mm.map(finite_limits);
+    wire::Recipe {
+        rule,
+        guard_band_k,
+        limits: wire::Limits {
+            d1_mm,
+            d2_mm,
+            angle_deviation_deg: limits_in_degrees(recipe.limits.angle_rad),
+        },
+        minimum_coverage: finite(recipe.minimum_coverage),
+        u_calibration_mm: finite(recipe.u_calibration_mm),
+        u_calibration_deg: degrees(recipe.u_calibration_rad),
+    }
+}
+
+/// The limits of an edge that the recipe may know by its entity, by its number or, once named, by its name.
+fn limits_of(recipe: &Recipe, index: usize, edge: &EdgeResult) -> Limits {
+    let number = format!("e{}", index + 1);
+    let own = recipe.edges.iter().find(|own| match &own.key {
+        EdgeKey::Entity(entity) => *entity == edge.nominal_entity,
+        EdgeKey::Id(id) => *id == edge.id || *id == number,
+    });
+    own.map_or(recipe.limits, |own| own.limits)
+}
+
+fn finite_limits(limits: Option<[f64; 2]>) -> Option<[f64; 2]> {
+    limits.filter(|limits| limits.iter().all(|limit| finite(*limit).is_some()))
+}
+
+fn limits_in_degrees(limits_rad: Option<[f64; 2]>) -> Option<[f64; 2]> {
+    finite_limits(limits_rad).map(|limits| limits.map(f64::to_degrees))
+}
+
+fn losses_from_device(losses: acies_drivers::device::Losses) -> wire::Losses {
+    wire::Losses {
+        received: losses.received,
+        lost_on_link: losses.lost_on_link,
+        dropped_by_device: losses.dropped_by_device,
+        rejected: losses.rejected,
+        skipped_bytes: losses.skipped_bytes,
+    }
+}
+
+fn scan_from_facts(facts: &Facts) -> wire::Scan {
+    let mut losses = wire::Losses::default();
+    for device in facts.devices.iter().filter_map(|device| device.losses) {
+        losses.received = losses.received.saturating_add(device.received);
+        losses.lost_on_link = losses.lost_on_link.saturating_add(device.lost_on_link);
+        losses.dropped_by_device = losses
+            .dropped_by_device
+            .saturating_add(device.dropped_by_device);
+        losses.rejected = losses.rejected.saturating_add(device.rejected);
+        losses.skipped_bytes = losses.skipped_bytes.saturating_add(device.skipped_bytes);
+    }
+    wire::Scan {
+        points: facts.scan.points,
+        spacing_mm: facts.scan.spacing_mm.and_then(finite),
+        spacing_along_line_mm: facts.scan.spacing_along_line_mm.and_then(finite),
+        spacing_across_lines_mm: facts.scan.spacing_across_lines_mm.and_then(finite),
+        noise_mm: facts.scan.noise_mm.and_then(finite),
+        losses,
+    }
+}
+
+fn devices_from_facts(facts: &Facts) -> Vec<wire::Device> {
+    facts
+        .devices
+        .iter()
+        .map(|device| wire::Device {
+            name: device.name.clone(),
+            vendor: device.identity.vendor.clone(),
+            model: device.identity.model.clone(),
+            serial: device.identity.serial.clone(),
+            firmware: device.identity.firmware.clone(),
+            losses: device.losses.map(losses_from_device),
+        })
+        .collect()
+}
+
+fn alignment_from_result(alignment: &Alignment) -> wire::Alignment {
+    let matrix = alignment.part_from_machine.matrix();
+    let rows = matrix.transpose().to_cols_array_2d();
+    let has_pose = rows.iter().flatten().all(|entry| finite(*entry).is_some());
+    let covariance = alignment.covariance;
+    let mut status = status_from_verdict(alignment.status);
+    if !has_pose {
+        status = status.max(Status::NotDecidable);
+    }
+    wire::Alignment {
+        part_from_machine: has_pose.then_some(rows),
+        rms_mm: finite(alignment.rms_mm),
+        points: alignment.points,
+        covariance: covariance
+            .iter()
+            .flatten()
+            .all(|entry| finite(*entry).is_some())
+            .then_some(covariance),
+        weak_directions: alignment.weak_directions.clone(),
+        status,
+    }
+}
+
+fn edge_from_result(
+    edge: &EdgeResult,
+    criteria: (&Limits, Rule),
+    findings: &mut Vec<String>,
+) -> wire::Edge {
+    let mut stations = Vec::with_capacity(edge.stations.len());
+    let mut verdict = status_from_verdict(edge.verdict);
+    for (index, result) in edge.stations.iter().enumerate() {
+        match station_from_result(result, edge.kind) {
+            Some(station) => {
+                if station.status > status_from_verdict(result.verdict) {
+                    verdict = verdict.max(station.status);
+                }
+                stations.push(station);
+            }
+            None => findings.push(format!(
+                "edge {}: the nominal place of station {index} {UNUSABLE}; the station is left out",
+                edge.id
+            )),
+        }
+    }
+    let (summary, characteristics) = evaluate(&edge.id, &stations, criteria);
+    wire::Edge {
+        id: edge.id.clone(),
+        nominal_entity: edge.nominal_entity,
+        kind: match edge.kind {
+            EdgeKind::Convex => wire::Kind::Convex,
+            EdgeKind::Concave => wire::Kind::Concave,
+        },
+        length_mm: finite(edge.length_mm),
+        coverage: finite(edge.coverage).unwrap_or(summary.measured_share),
+        stations,
+        summary,
+        characteristics,
+        verdict,
+    }
+}
+
+/// Summary and characteristics of one edge under its limits.
+fn evaluate(
+    id: &str,
+    stations: &[wire::Station],
+    (limits, rule): (&Limits, Rule),
+) -> (wire::Summary, Vec<wire::Characteristic>) {
+    let quantities = [
+        (Quantity::D1, finite_limits(limits.d_mm[0])),
+        (Quantity::D2, finite_limits(limits.d_mm[1])),
+        (
+            Quantity::AngleDeviation,
+            limits_in_degrees(limits.angle_rad),
+        ),
+    ];
+    let values = quantities.map(|(quantity, _)| samples(stations, quantity));
+    let spreads: [Option<wire::Spread>; 3] =
+        std::array::from_fn(|i| spread(&values[i], quantities[i].1));
+    let measured = stations.iter().filter(|s| s.measured.is_some()).count();
+    let summary = wire::Summary {
+        stations: stations.len(),
+        measured,
+        measured_share: measured as f64 / stations.len().max(1) as f64,
+        d1_mm: spreads[0],
+        d2_mm: spreads[1],
+        angle_deviation_deg: spreads[2],
+    };
+    let characteristics = quantities
+        .iter()
+        .zip(&values)
+        .map(|(&(quantity, limits), values)| {
+            characteristic(id, quantity, values, Criterion { limits, rule })
+        })
+        .collect();
+    (summary, characteristics)
+}
+
+const UNUSABLE: &str = "is not a number below 1e9";
+
+/// `None` where the nominal place itself is not finite.
+fn station_from_result(result: &StationResult, kind: EdgeKind) -> Option<wire::Station> {
+    let place = &result.station;
+    let turn_angle_rad = place.normals[0].angle_between(place.normals[1]);
+    let nominal_included_angle_rad = match kind {
+        EdgeKind::Convex => PI - turn_angle_rad,
+        EdgeKind::Concave => PI + turn_angle_rad,
+    };
+    let mut station = wire::Station {
+        s_mm: finite(place.s_mm)?,
+        nominal: xyz(place.point)?,
+        tangent: xyz(place.tangent)?,
+        n1: xyz(place.normals[0])?,
+        n2: xyz(place.normals[1])?,
+        nominal_included_angle_deg: degrees(nominal_included_angle_rad)?,
+        measured: None,
+        d1_mm: None,
+        d2_mm: None,
+        u_d1_mm: None,
+        u_d2_mm: None,
+        included_angle_deg: None,
+        u_included_angle_deg: None,
+        residual_1_mm: None,
+        residual_2_mm: None,
+        points_1: result.points[0],
+        points_2: result.points[1],
+        status: status_from_verdict(result.verdict),
+        reason: result.reason.clone(),
+    };
+    if let Some(measured) = &result.measured {
+        fill_measured(&mut station, measured);
+    }
+    Some(station)
+}
+
+/// Takes over what is finite; says what was not.
+fn fill_measured(station: &mut wire::Station, measured: &crate::inspect::result::Measured) {
+    let point = xyz(measured.point);
+    let [d1, d2] = measured.d_mm.map(finite);
+    let (Some(_), Some(_), Some(_)) = (point, d1, d2) else {
+        lower(station, &format!("the measured edge {UNUSABLE}"));
+        return;
+    };
+    station.measured = point;
+    (station.d1_mm, station.d2_mm) = (d1, d2);
+    [station.u_d1_mm, station.u_d2_mm] = measured.u_d_mm.map(finite);
+    station.included_angle_deg = degrees(measured.included_angle_rad);
+    station.u_included_angle_deg = degrees(measured.u_included_angle_rad);
+    [station.residual_1_mm, station.residual_2_mm] = measured.residual_mm.map(finite);
+    let without = [
+        (station.u_d1_mm, "uncertainty of d1"),
+        (station.u_d2_mm, "uncertainty of d2"),
+        (station.included_angle_deg, "included angle"),
+        (
+            station.u_included_angle_deg,
+            "uncertainty of the included angle",
+        ),
+    ]
+    .into_iter()
+    .filter(|(value, _)| value.is_none());
+    for (_, name) in without {
+        lower(station, &format!("the {name} {UNUSABLE}"));
+    }
+}
+
+fn lower(station: &mut wire::Station, reason: &str) {
+    station.status = station.status.max(Status::NotDecidable);
+    if !station.reason.is_empty() {
+        station.reason.push_str("; ");
+    }
+    station.reason.push_str(reason);
+}

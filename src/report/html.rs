@@ -1,0 +1,361 @@
+//! The report as one HTML file that needs nothing else: no network, no other file; it opens by a double click.
+//!
+//! For the operator first: the verdict with its reason, then the edges, then where they lie, then each edge in full, then
+//! what the metrologist asks for. Without scripts everything is there save the turning of the part.
+
+mod drawing;
+mod facts;
+mod page;
+mod plot;
+
+use std::fmt::{self, Write};
+
+use base64::Engine as _;
+use sha2::{Digest, Sha256};
+
+use super::figure::Figure;
+use super::wire::{Characteristic, Edge, Kind, Quantity, Report, Status};
+use drawing::Drawing;
+use page::{Escaped, PlusMinus, SYMBOLS, State, class, word};
+
+const STYLE: &str = include_str!("html/style.css");
+const SCRIPT: &str = include_str!("html/viewer.js");
+
+/// Stations drawn on one page. More make it larger than 1.5 MB; the JSON and the CSV hold all of them.
+const STATIONS_DRAWN: usize = 6000;
+
+impl Report {
+    /// The report as a self-contained page.
+    pub fn to_html(&self) -> String {
+        self.page(&[])
+    }
+
+    /// The page with links to the other forms, where a server has them: (address, name).
+    pub fn to_html_with_links(&self, links: &[(&str, &str)]) -> String {
+        self.page(links)
+    }
+
+    fn page(&self, links: &[(&str, &str)]) -> String {
+        let mut out = String::with_capacity(1 << 18);
+        write_page(&mut out, self, links).expect("writing to a String cannot fail");
+        out
+    }
+}
+
+/// What the page may load: its own style and script, known by their hashes, and nothing else.
+pub fn content_security_policy() -> String {
+    format!(
+        "default-src 'none'; style-src '{}'; script-src '{}'; base-uri 'none'; form-action 'none'",
+        hash(STYLE),
+        hash(SCRIPT)
+    )
+}
+
+fn hash(text: &str) -> String {
+    let digest = base64::engine::general_purpose::STANDARD.encode(Sha256::digest(text));
+    format!("sha256-{digest}")
+}
+
+fn write_page(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt::Result {
+    let shown: Vec<_> = report
+        .edges
+        .iter()
+        .map(|edge| stations_shown(edge, report.edges.len()))
+        .collect();
+    write!(
+        out,
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+         <meta http-equiv=\"Content-Security-Policy\" content=\"{}\">\n\
+         <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
+         <meta name=\"generator\" content=\"{} {}\">\n<title>{}: {}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n{SYMBOLS}",
+        content_security_policy(),
+        Escaped(&report.software.name),
+        Escaped(&report.software.version),
+        word(report.verdict),
+        Escaped(&report.part)
+    )?;
+    write_header(out, report, links)?;
+    out.write_str("<main>\n")?;
+    write_table(out, report)?;
+    let drawing = Drawing::new(report, &shown);
+    if !drawing.is_empty() {
+        write_view(out, &drawing)?;
+    }
+    write_edges(out, report, &shown)?;
+    facts::write(out, report)?;
+    out.write_str("</main>\n")?;
+    write_footer(out, report)?;
+    if !drawing.is_empty() {
+        // Inside a script element only `<` could end it early.
+        let data = drawing.data().to_string().replace('<', "\\u003c");
+        writeln!(
+            out,
+            r#"<script type="application/json" id="view-data">{data}</script>"#
+        )?;
+        writeln!(out, "<script>{SCRIPT}</script>")?;
+    }
+    out.write_str("</body>\n</html>\n")
+}
+
+/// The stations of `edge` that are drawn: all, or evenly thinned with the worst ones and the ends of holes kept.
+fn stations_shown(edge: &Edge, edges: usize) -> Vec<usize> {
+    let budget = (STATIONS_DRAWN / edges.max(1)).max(12);
+    let all = edge.stations.len();
+    if all <= budget {
+        return (0..all).collect();
+    }
+    let measured = |index: usize| edge.stations[index].measured.is_some();
+    let ends_of_holes: Vec<usize> = (1..all)
+        .filter(|&index| measured(index) != measured(index - 1))
+        .flat_map(|index| [index - 1, index])
+        .take(budget)
+        .collect();
+    let worst = |s_mm: f64| edge.characteristics.iter().any(|c| c.s_mm == Some(s_mm));
+    let mut shown: Vec<usize> = (0..all)
+        .filter(|&index| {
+            index % all.div_ceil(budget) == 0
+                || index + 1 == all
+                || worst(edge.stations[index].s_mm)
+        })
+        .chain(ends_of_holes)
+        .collect();
+    shown.sort_unstable();
+    shown.dedup();
+    shown
+}
+
+fn write_header(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt::Result {
+    write!(
+        out,
+        "<header>\n<a class=\"skip\" href=\"#edges\">Skip to the edges</a>\n<h1>{}</h1>\n<p class=\"soft\">measured {} against {}",
+        Escaped(&report.part),
+        Escaped(&report.created.replace('T', " ").replace('Z', " UTC")),
+        Escaped(&report.nominal)
+    )?;
+    if report.simulated {
+        out.write_str(" <span class=\"tag\">SIMULATED</span>")?;
+    }
+    out.write_str("</p>\n")?;
+    if !links.is_empty() {
+        out.write_str("<nav class=\"small\" aria-label=\"Other forms\">")?;
+        for (address, name) in links {
+            write!(
+                out,
+                "<a href=\"{}\">{}</a> ",
+                Escaped(address),
+                Escaped(name)
+            )?;
+        }
+        out.write_str("</nav>\n")?;
+    }
+    let class = class(report.verdict);
+    writeln!(
+        out,
+        "<section class=\"verdict bg-{class}\" aria-label=\"Verdict\"><svg aria-hidden=\"true\" viewBox=\"0 0 24 24\"><use href=\"#i-{class}\"/></svg>\
+         <div><strong>{}</strong><p>{}</p><p class=\"advice\">{}</p></div></section>\n</header>",
+        word(report.verdict),
+        Escaped(&sentence(&report.reason)),
+        Escaped(&sentence(&report.advice))
+    )
+}
+
+/// With a capital (save for the id of an edge) and a dot.
+fn sentence(text: &str) -> String {
+    let word = text.split([' ', ':']).next().unwrap_or("");
+    let is_name = word.chars().any(|c| !c.is_alphabetic()) || text[word.len()..].starts_with(':');
+    let mut chars = text.chars();
+    match chars.next() {
+        Some(first) if !is_name => format!("{}{}.", first.to_uppercase(), chars.as_str()),
+        Some(_) => format!("{text}."),
+        None => String::new(),
+    }
+}
+
+fn write_table(out: &mut String, report: &Report) -> fmt::Result {
+    out.write_str(
+        "<section class=\"card\" id=\"edges\"><h2>Edges</h2>\n<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"Table of edges\">\
+         <table class=\"edges\"><thead><tr><th scope=\"col\">Edge</th><th scope=\"col\">Verdict</th>\
+         <th scope=\"col\" class=\"n\">d1 worst<br>± U, µm</th><th scope=\"col\" class=\"n\">d2 worst<br>± U, µm</th>\
+         <th scope=\"col\" class=\"n\">angle deviation<br>worst ± U, °</th><th scope=\"col\">measured</th>\
+         <th scope=\"col\" class=\"n\">length<br>mm</th><th scope=\"col\">kind</th><th scope=\"col\" class=\"n\">STEP</th></tr></thead>\n<tbody>\n",
+    )?;
+    for (index, edge) in report.edges.iter().enumerate() {
+        write_row(out, index, edge)?;
+    }
+    out.write_str("</tbody></table></div>\n")?;
+    out.write_str(
+        "<p class=\"small soft\">d1 and d2 are the distances of the measured edge from the nominal one, along the outward normals of its two faces; \
+         plus is material outside the nominal. U is twice the standard uncertainty: about 95 % of values lie within it.</p></section>\n",
+    )
+}
+
+fn write_row(out: &mut String, index: usize, edge: &Edge) -> fmt::Result {
+    write!(
+        out,
+        "<tr><th scope=\"row\"><a href=\"#edge-{index}\">{}</a></th><td>{}</td>",
+        Escaped(&edge.id),
+        State(edge.verdict)
+    )?;
+    for characteristic in &edge.characteristics {
+        write_figure_cell(out, characteristic)?;
+    }
+    let share = edge.coverage.clamp(0.0, 1.0);
+    writeln!(
+        out,
+        "<td>{}<svg class=\"bar\" viewBox=\"0 0 100 10\" preserveAspectRatio=\"none\" aria-hidden=\"true\"><rect class=\"all\" width=\"100\" height=\"10\"/>\
+         <rect class=\"got\" width=\"{:.1}\" height=\"10\"/></svg></td><td class=\"n\">{}</td><td>{}</td><td class=\"n\">#{}</td></tr>",
+        percent(share),
+        100.0 * share,
+        edge.length_mm
+            .map_or_else(|| "–".to_owned(), |length| format!("{length:.1}")),
+        kind(edge),
+        edge.nominal_entity
+    )
+}
+
+fn write_figure_cell(out: &mut String, characteristic: &Characteristic) -> fmt::Result {
+    match characteristic.value {
+        Some(value) => {
+            let figure = Figure::of(characteristic.quantity, value, characteristic.u);
+            let bad = if characteristic.verdict == Status::NotOk {
+                " bad"
+            } else {
+                ""
+            };
+            write!(out, "<td class=\"n{bad}\">{}</td>", PlusMinus(&figure))
+        }
+        None => out.write_str("<td class=\"n soft\">not measured</td>"),
+    }
+}
+
+/// Whole percent; what is not all never reads as 100, what is not nothing never as 0.
+pub(super) fn percent(share: f64) -> String {
+    match 100.0 * share {
+        p if p >= 100.0 => "100 %".to_owned(),
+        p if p > 0.0 => format!("{:.0} %", p.clamp(1.0, 99.0)),
+        _ => "0 %".to_owned(),
+    }
+}
+
+pub(super) fn kind(edge: &Edge) -> &'static str {
+    match edge.kind {
+        Kind::Convex => "convex",
+        Kind::Concave => "concave",
+    }
+}
+
+fn write_view(out: &mut String, drawing: &Drawing<'_>) -> fmt::Result {
+    out.write_str("<section class=\"card\"><h2>Where</h2>\n<div class=\"view\" id=\"view\">\n")?;
+    drawing.write_svg(out)?;
+    writeln!(
+        out,
+        "</div>\n<p class=\"small soft\" id=\"view-factor\">Hair lines show the deviations × {}.</p>\n\
+         <div class=\"tools live\" id=\"view-tools\" hidden>\
+         <button type=\"button\" data-view=\"home\">Home</button><button type=\"button\" data-view=\"front\">Front</button>\
+         <button type=\"button\" data-view=\"side\">Side</button><button type=\"button\" data-view=\"top\">Top</button>\
+         <button type=\"button\" data-zoom=\"1.25\" aria-label=\"Zoom in\">+</button><button type=\"button\" data-zoom=\"0.8\" aria-label=\"Zoom out\">−</button>\
+         <label>deviations <input type=\"range\" id=\"view-scale\" min=\"0\" step=\"1\"> <output id=\"view-scale-shown\"></output></label></div>\n\
+         <p class=\"readout live\" id=\"view-readout\" role=\"status\"></p>",
+        drawing.factor
+    )?;
+    out.write_str("<ul class=\"legend drawing-legend\">")?;
+    for (state, name) in [
+        ("run s-ok", "OK"),
+        ("run s-not_ok", "NOT OK: thick"),
+        ("run s-not_decidable", "NOT DECIDABLE: dashed"),
+        ("run s-undefined", "not judged"),
+        ("run s-gap", "not measured: dotted"),
+        ("hair", "deviation, enlarged"),
+        ("extra", "not in the nominal: red, dotted"),
+    ] {
+        write!(
+            out,
+            "<li><svg class=\"drawing\" viewBox=\"0 0 44 12\" aria-hidden=\"true\"><path class=\"{state}\" d=\"M3 6H41\"/></svg>{name}</li>"
+        )?;
+    }
+    out.write_str("</ul></section>\n")
+}
+
+fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::Result {
+    out.write_str("<section class=\"card\"><h2>Each edge</h2>\n<p class=\"small soft\">Line: deviation. Band around it: ± U. \
+         Tinted stripe: within the limits; dashed lines: the limits, value at the right. Hatched: not measured. Diamond: the worst place.</p>\n")?;
+    for (index, (edge, shown)) in report.edges.iter().zip(shown).enumerate() {
+        writeln!(
+            out,
+            "<section class=\"edge\" id=\"edge-{index}\"><h3>{} {} <span class=\"soft small\">{}, {} mm, {} measured, STEP #{}</span></h3>",
+            Escaped(&edge.id),
+            State(edge.verdict),
+            kind(edge),
+            edge.length_mm
+                .map_or_else(|| "–".to_owned(), |length| format!("{length:.1}")),
+            percent(edge.coverage),
+            edge.nominal_entity
+        )?;
+        write_reasons(out, edge)?;
+        out.write_str("<div class=\"plots\">")?;
+        plot::write(out, edge, Quantity::D1, shown)?;
+        plot::write(out, edge, Quantity::D2, shown)?;
+        if angle_matters(edge) {
+            plot::write(out, edge, Quantity::AngleDeviation, shown)?;
+        }
+        out.write_str("</div>")?;
+        if shown.len() < edge.stations.len() {
+            write!(
+                out,
+                "<p class=\"small soft\">{} of {} stations are drawn; the CSV and JSON forms hold all.</p>",
+                shown.len(),
+                edge.stations.len()
+            )?;
+        }
+        out.write_str("</section>\n")?;
+    }
+    out.write_str("</section>\n")
+}
+
+/// The angle is plotted where it keeps the edge from being OK.
+fn angle_matters(edge: &Edge) -> bool {
+    edge.characteristics
+        .iter()
+        .any(|c| c.quantity == Quantity::AngleDeviation && c.verdict > Status::Ok)
+}
+
+/// Where along the edge something was not measured or not decidable, and why.
+fn write_reasons(out: &mut String, edge: &Edge) -> fmt::Result {
+    const SHOWN: usize = 6;
+    let mut runs: Vec<(f64, f64, &str)> = Vec::new();
+    let mut open = false;
+    for station in &edge.stations {
+        let reason = station.reason.as_str();
+        match runs.last_mut() {
+            Some(run) if open && run.2 == reason => run.1 = station.s_mm,
+            _ if !reason.is_empty() => runs.push((station.s_mm, station.s_mm, reason)),
+            _ => {}
+        }
+        open = !reason.is_empty();
+    }
+    if runs.is_empty() {
+        return Ok(());
+    }
+    out.write_str("<ul class=\"small\">")?;
+    for (from, to, reason) in runs.iter().take(SHOWN) {
+        let place = if from == to {
+            format!("{from:.1} mm")
+        } else {
+            format!("{from:.1} to {to:.1} mm")
+        };
+        write!(out, "<li>{place}: {}</li>", Escaped(reason))?;
+    }
+    if runs.len() > SHOWN {
+        write!(out, "<li>and {} more stretches</li>", runs.len() - SHOWN)?;
+    }
+    out.write_str("</ul>\n")
+}
+
+fn write_footer(out: &mut String, report: &Report) -> fmt::Result {
+    writeln!(
+        out,
+        "<footer class=\"small soft\"><p>Made by {} {}. This page is complete in itself: it loads nothing from anywhere.</p></footer>",
+        Escaped(&report.software.name),
+        Escaped(&report.software.version)
+    )
+}

@@ -1,0 +1,313 @@
+//! All points of a cloud at once.
+
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
+
+use super::flank::Nearest;
+use super::lines;
+use super::robust::robust_normal;
+use super::{LINE_SPACING, Meetings, Place, Scale, Scratch, Settings, Surface, SurfaceError};
+use crate::points::{Neighbors, PointCloud};
+
+/// Points whose results are held at once, before they go to their places.
+const BLOCK: usize = 32_768;
+
+/// Points a worker takes at a time.
+const GRAIN: usize = 256;
+
+/// A cloud's points on its surface, in input order.
+#[derive(Debug, Clone)]
+pub struct Reconstruction {
+    /// N positions, mm; where `projected` is false, those of the input.
+    pub positions: Vec<DVec3>,
+    /// N unit normals, signs arbitrary; zero where `projected` is false. On an edge, that of one of the two flanks.
+    pub normals: Vec<Vec3>,
+    /// Whether a point was taken onto the surface, or left where it was.
+    pub projected: Vec<bool>,
+    /// Points whose place is on an edge or at a corner, ascending, with the normals of the other flanks.
+    pub sharp: Vec<SharpPoint>,
+    /// The feature lines and corners, sampled at `line_spacing_mm`.
+    pub lines: Vec<LinePoint>,
+    /// Distance of samples along a feature line, mm.
+    pub line_spacing_mm: f64,
+    /// The sizes that everything followed from.
+    pub scale: Scale,
+}
+
+/// A point of the cloud that ended on an edge or at a corner.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SharpPoint {
+    /// Index of the point.
+    pub index: u32,
+    /// On an edge or at a corner.
+    pub place: Place,
+    /// Unit normals of the other flanks; at an edge both entries are equal.
+    pub other_normals: [Vec3; 2],
+}
+
+/// A sample of a feature line, or a corner.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LinePoint {
+    /// The sample, mm.
+    pub position: DVec3,
+    /// Unit normals of the flanks that meet: two, or three at a corner; the rest repeat the last.
+    pub normals: [Vec3; 3],
+    /// On an edge or at a corner.
+    pub place: Place,
+}
+
+/// Result for one point, until it goes to its place.
+#[derive(Clone, Copy)]
+struct Landed {
+    index: u32,
+    position: DVec3,
+    normal: Vec3,
+    state: State,
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum State {
+    Smooth,
+    Suspicious,
+    Lost,
+}
+
+/// What the first pass hands to a reconstruction.
+pub(super) struct Sink<'s> {
+    positions: &'s mut [DVec3],
+    projected: &'s mut [bool],
+}
+
+/// Takes every point of `cloud` onto the surface through it.
+///
+/// The result does not depend on the number of threads. Memory above the cloud and its neighbours: 50 bytes a point.
+///
+/// # Errors
+/// [`SurfaceError::TooFewPoints`].
+pub fn reconstruct(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    settings: Settings,
+) -> Result<Reconstruction, SurfaceError> {
+    let mut surface = Surface::unprepared(cloud, neighbors, settings)?;
+    let mut positions = cloud.positions.clone();
+    let mut projected = vec![false; positions.len()];
+    let mut features = Features::default();
+    let normals = if surface.scale.thinning_mm > 0.0 {
+        prepare(&mut surface, None);
+        let mut normals = vec![Vec3::ZERO; positions.len()];
+        let all = neighbors.order();
+        features.land(&surface, cloud, (all, true), |landed| {
+            let index = landed.index as usize;
+            normals[index] = landed.normal;
+            positions[index] = landed.position;
+            projected[index] = landed.state == State::Smooth;
+        });
+        normals
+    } else {
+        let sink = Sink {
+            positions: &mut positions,
+            projected: &mut projected,
+        };
+        let suspicious = prepare(&mut surface, Some(sink));
+        let mut later = Vec::with_capacity(suspicious.len());
+        features.land(&surface, cloud, (&suspicious, false), |landed| {
+            later.push(landed)
+        });
+        let mut normals = std::mem::take(&mut surface.normals);
+        for landed in later {
+            let index = landed.index as usize;
+            normals[index] = landed.normal;
+            positions[index] = landed.position;
+            projected[index] = landed.state == State::Smooth;
+        }
+        normals
+    };
+    features.sharp.sort_unstable_by_key(|s| s.index);
+    let line_spacing_mm = LINE_SPACING * surface.scale.spacing_mm;
+    Ok(Reconstruction {
+        positions,
+        normals,
+        projected,
+        sharp: features.sharp,
+        lines: lines::agree(features.lines, line_spacing_mm),
+        line_spacing_mm,
+        scale: surface.scale,
+    })
+}
+
+/// First normals and trust of all supporting points: where the surroundings are smooth the surface's own, elsewhere those of a plane
+/// that neighbouring flanks do not tilt. Returns the indices of the latter, neighbours together; the positions of the former go to `sink`.
+pub(super) fn prepare(surface: &mut Surface, mut sink: Option<Sink>) -> Vec<u32> {
+    let order: Vec<u32> = surface.neighbors.get().order().to_vec();
+    let mut suspicious = Vec::new();
+    for block in order.chunks(BLOCK) {
+        let landed = in_parallel(block, |index, scratch| surface.first_look(index, scratch));
+        for point in landed {
+            let index = point.index as usize;
+            surface.normals[index] = point.normal;
+            if point.state == State::Suspicious {
+                suspicious.push(point.index);
+            } else if let Some(sink) = &mut sink {
+                sink.positions[index] = point.position;
+                sink.projected[index] = true;
+            }
+        }
+    }
+    for block in suspicious.chunks(BLOCK) {
+        let looked = in_parallel(block, |index, scratch| surface.second_look(index, scratch));
+        for (&index, (normal, trust)) in block.iter().zip(looked) {
+            surface.normals[index as usize] = normal;
+            surface.trust[index as usize] = trust;
+        }
+    }
+    suspicious
+}
+
+fn in_parallel<T: Send>(block: &[u32], work: impl Fn(u32, &mut Scratch) -> T + Sync) -> Vec<T> {
+    let parts: Vec<Vec<T>> = block
+        .par_chunks(GRAIN)
+        .map_init(Scratch::default, |scratch, part| {
+            part.iter().map(|&index| work(index, scratch)).collect()
+        })
+        .collect();
+    parts.into_iter().flatten().collect()
+}
+
+impl Surface<'_> {
+    fn first_look(&self, index: u32, scratch: &mut Scratch) -> Landed {
+        let p = self.positions[index as usize];
+        self.gather(p, self.scale.points, scratch);
+        match self.smooth_outcome(scratch) {
+            Some(outcome) => Landed {
+                index,
+                position: p + outcome.nearest.position,
+                normal: outcome.nearest.normals[0].as_vec3(),
+                state: State::Smooth,
+            },
+            None => Landed {
+                index,
+                position: p,
+                normal: Vec3::ZERO,
+                state: State::Suspicious,
+            },
+        }
+    }
+
+    fn second_look(&self, index: u32, scratch: &mut Scratch) -> (Vec3, u8) {
+        let p = self.positions[index as usize];
+        self.gather(p, self.scale.points_near(), scratch);
+        match robust_normal(&scratch.hood.points, &self.scale) {
+            Some((normal, trust)) => (normal.as_vec3(), (trust * 255.0) as u8),
+            None => (Vec3::Z, 0),
+        }
+    }
+
+    /// Longest way a point of the cloud itself may go, mm: beyond it, it is an outlier and stays.
+    fn longest_way_mm(&self) -> f64 {
+        6.0 * self.scale.noise_mm + 0.5 * self.scale.spacing_mm
+    }
+}
+
+/// Edges and corners met on the way.
+#[derive(Default)]
+struct Features {
+    sharp: Vec<SharpPoint>,
+    lines: Vec<LinePoint>,
+}
+
+impl Features {
+    fn land(
+        &mut self,
+        surface: &Surface,
+        cloud: &PointCloud,
+        (indices, try_smooth): (&[u32], bool),
+        mut put: impl FnMut(Landed),
+    ) {
+        for block in indices.chunks(BLOCK) {
+            let landed = in_parallel(block, |index, scratch| {
+                land_one(
+                    surface,
+                    cloud.positions[index as usize],
+                    try_smooth,
+                    scratch,
+                )
+            });
+            for (&index, (nearest, meetings)) in block.iter().zip(landed) {
+                let p = cloud.positions[index as usize];
+                self.lines
+                    .extend(meetings.iter().flatten().map(|m| line_point(p, m)));
+                let Some(nearest) = nearest else {
+                    put(Landed {
+                        index,
+                        position: p,
+                        normal: Vec3::ZERO,
+                        state: State::Lost,
+                    });
+                    continue;
+                };
+                if nearest.sheets > 1 {
+                    self.sharp.push(SharpPoint {
+                        index,
+                        place: place(nearest.sheets),
+                        other_normals: [nearest.normals[1].as_vec3(), nearest.normals[2].as_vec3()],
+                    });
+                }
+                put(Landed {
+                    index,
+                    position: p + nearest.position,
+                    normal: nearest.normals[0].as_vec3(),
+                    state: State::Smooth,
+                });
+            }
+        }
+    }
+}
+
+fn place(sheets: usize) -> Place {
+    match sheets {
+        1 => Place::Face,
+        2 => Place::Edge,
+        _ => Place::Corner,
+    }
+}
+
+fn line_point(p: DVec3, nearest: &Nearest) -> LinePoint {
+    LinePoint {
+        position: p + nearest.position,
+        normals: nearest.normals.map(|n| n.as_vec3()),
+        place: place(nearest.sheets),
+    }
+}
+
+fn land_one(
+    surface: &Surface,
+    p: DVec3,
+    try_smooth: bool,
+    scratch: &mut Scratch,
+) -> (Option<Nearest>, Meetings) {
+    let outcome = if try_smooth {
+        surface.outcome(p, scratch)
+    } else {
+        surface.gather(p, surface.scale.points_wide(), scratch);
+        surface.sharp_outcome(scratch)
+    };
+    let Some(outcome) = outcome else {
+        return (None, Meetings::default());
+    };
+    let longest = surface.longest_way_mm();
+    // Lines are sampled from as far as the flanks' own points reach beyond doubt.
+    let near = longest + 1.5 * surface.scale.spacing_mm;
+    let meetings = outcome
+        .meetings
+        .map(|m| m.filter(|m| m.position.length() < near));
+    let nearest = Some(outcome.nearest).filter(|n| n.position.length() <= longest);
+    (
+        nearest,
+        if nearest.is_some() {
+            meetings
+        } else {
+            Meetings::default()
+        },
+    )
+}

@@ -1,0 +1,192 @@
+//! Configurations: every mistake is told at once, with its line, what was seen and what is allowed.
+
+use std::path::{Path, PathBuf};
+
+use acies::config::Cell;
+
+/// A sound cell; the tests break it.
+const SOUND: &str = r#"name = "bench"
+
+[part]
+nominal = "part.step"
+[part.machine_from_part]
+origin_mm = [10, 20.5, 0]
+x_axis = [0, 1, 0]
+z_axis = [0, 0, 1]
+
+[stage]
+travel_mm_per_count = [0, 0.001, 0]
+end_count = 60000
+
+[[device]]
+name = "left"
+driver = "open-profile"
+port = "./dev/left"
+rate_hz = 500
+[device.calibration]
+origin_mm = [0, 0, 110]
+x_axis = [1, 0, 0]
+z_axis = [0, 0, -1]
+
+[[device]]
+name = "right"
+driver = "open-profile"
+address = "127.0.0.1:7450"
+[device.calibration]
+origin_mm = [0, 0, 110]
+x_axis = [1, 0, 0]
+z_axis = [0, 0, -1]
+"#;
+
+/// A folder of its own with a file `part.step` in it, and the path of a configuration beside it.
+fn folder(name: &str) -> PathBuf {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    std::fs::create_dir_all(&folder).expect("a folder for the test");
+    std::fs::write(folder.join("part.step"), "ISO-10303-21;").expect("a file for the test");
+    folder.join("cell.toml")
+}
+
+/// The mistakes of `text` as lines, without the folder.
+fn mistakes(name: &str, text: &str) -> Vec<String> {
+    let path = folder(name);
+    let folder = format!("{}/", path.parent().expect("a folder").display());
+    let errors = Cell::parse(text, &path).expect_err("mistakes");
+    errors
+        .mistakes
+        .iter()
+        .map(|mistake| mistake.to_string().replace(&folder, ""))
+        .collect()
+}
+
+#[test]
+fn a_sound_cell_becomes_values() {
+    let path = folder("sound");
+    let cell = Cell::parse(SOUND, &path).expect("a sound cell");
+    assert_eq!(
+        (cell.name.as_str(), cell.profilers.len(), cell.probes.len()),
+        ("bench", 2, 0)
+    );
+    assert_eq!(cell.plan.end_count, 60000);
+    let x_in_machine = cell.machine_from_part.vector(glam::DVec3::X);
+    assert!(
+        (x_in_machine - glam::DVec3::Y).length() < 1e-12,
+        "{x_in_machine}"
+    );
+    let claims: Vec<String> = cell
+        .profilers
+        .iter()
+        .flat_map(|p| p.setup.claims())
+        .map(|claim| claim.to_string())
+        .collect();
+    let folder = path.parent().expect("a folder");
+    assert_eq!(
+        claims,
+        [
+            format!("port {}/dev/left", folder.display()),
+            "address 127.0.0.1:7450".to_owned()
+        ]
+    );
+}
+
+#[test]
+fn unknown_keys_wrong_units_and_wrong_types_are_told_together() {
+    let text = SOUND
+        .replace("name = \"bench\"", "nmae = \"bench\"")
+        .replace("rate_hz = 500", "rate_khz = 0.5\ncolumns = 0")
+        .replace(
+            "travel_mm_per_count = [0, 0.001, 0]",
+            "travel_mm_per_count = [0, 1000, 0]",
+        )
+        .replace("end_count = 60000", "end_count = \"60 mm\"")
+        .replace("nominal = \"part.step\"", "nominal = \"absent.step\"");
+    assert_eq!(
+        mistakes("together", &text),
+        [
+            "cell.toml: name: nothing, expected a text",
+            "cell.toml:1: nmae: an unknown key, expected one of name, part, stage, device",
+            "cell.toml:4: part: nominal: no file absent.step, expected a file that exists",
+            "cell.toml:12: stage: end_count: \"60 mm\", expected a whole number of -1000000000000 to \
+             1000000000000",
+            "cell.toml:11: stage: travel_mm_per_count: 1000 mm a count, expected a length of 1e-7 to 10 mm a count",
+            "cell.toml:19: device \"left\": columns: 0, expected a whole number of 1 to 32768",
+            "cell.toml:18: device \"left\": rate_khz: an unknown key, expected one of baud, port, usb_serial, \
+             usb_id, address, serial_number, trigger, encoder_step, columns, rate_hz, exposure_us, \
+             laser_power_percent, keepalive_s",
+        ]
+    );
+}
+
+#[test]
+fn two_devices_on_one_port_are_named() {
+    let text = SOUND.replace("address = \"127.0.0.1:7450\"", "port = \"./dev/left\"");
+    assert_eq!(
+        mistakes("one-port", &text),
+        [
+            "cell.toml: device: port: port dev/left is wanted by \"left\" and \"right\", expected one device on each port"
+        ]
+    );
+    let text = SOUND.replace("\"right\"", "\"left\"");
+    assert_eq!(
+        mistakes("one-name", &text),
+        [
+            "cell.toml: device: name: \"left\" more than once, expected a name of its own for every device"
+        ]
+    );
+}
+
+#[test]
+fn a_pose_must_be_a_pose() {
+    let text = SOUND.replacen("z_axis = [0, 0, -1]", "z_axis = [0.1, 0, -1]", 1);
+    let told = mistakes("pose", &text);
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert!(
+        told[0].starts_with(
+            "cell.toml:21: device \"left\": calibration.x_axis: lengths 1 and 1.00498"
+        ),
+        "{told:?}"
+    );
+    assert!(
+        told[0].ends_with("expected unit vectors at right angles, to six digits"),
+        "{told:?}"
+    );
+}
+
+#[test]
+fn a_device_is_a_profiler_or_a_probe() {
+    let text = SOUND.replace("[device.calibration]", "[device.calibratoin]");
+    let told = mistakes("neither", &text);
+    assert!(
+        told.contains(
+            &"cell.toml:14: device \"left\": calibration: neither, expected [device.calibration] for a profiler or \
+              [device.tip] for a probe"
+                .to_owned()
+        ),
+        "{told:?}"
+    );
+    let text = SOUND.replacen("driver = \"open-profile\"", "driver = \"openprofile\"", 1);
+    assert_eq!(
+        mistakes("driver", &text)[0],
+        format!(
+            "cell.toml:16: device \"left\": driver: \"openprofile\", expected one of {}",
+            acies_drivers::ALL
+                .iter()
+                .map(|driver| driver.name)
+                .collect::<Vec<_>>()
+                .join(", ")
+        )
+    );
+}
+
+#[test]
+fn text_that_is_no_toml_is_told_with_its_line() {
+    let told = mistakes("syntax", "name = \"a\"\n[part\n");
+    assert_eq!(told.len(), 1);
+    assert!(told[0].starts_with("cell.toml:2: syntax: "), "{told:?}");
+    let absent = Cell::read(Path::new("/nowhere/cell.toml"))
+        .expect_err("no such file")
+        .to_string();
+    assert_eq!(
+        absent,
+        "/nowhere/cell.toml: file: No such file or directory (os error 2), expected a readable TOML file"
+    );
+}
