@@ -80,13 +80,7 @@ fn add_hole(solid: &mut Solid, hole: &Hole) {
             .push(Line::Arc(centre, DVec3::Z, DVec3::X * hole.radius, TAU));
     }
     if hole.blind {
-        solid.faces.push(Face::Round {
-            base,
-            axis: DVec3::Z * 1e-9,
-            start: DVec3::X,
-            radii: (0.0, hole.radius),
-            sweep: TAU,
-        });
+        solid.faces.push(Face::Disc { centre: base, normal: DVec3::Z, radius: hole.radius });
     }
 }
 
@@ -110,6 +104,7 @@ fn centred(mut solid: Solid) -> Solid {
         match face {
             Face::Flat { origin, .. } => *origin += shift,
             Face::Round { base, .. } => *base += shift,
+            Face::Disc { centre, .. } => *centre += shift,
         }
     }
     for line in solid.edges.iter_mut().chain(&mut solid.borders) {
@@ -239,13 +234,7 @@ pub fn cone(radius: f64, height: f64) -> Solid {
                 radii: (radius, 0.0),
                 sweep: TAU,
             },
-            Face::Round {
-                base,
-                axis: DVec3::Z * 1e-9,
-                start: DVec3::X,
-                radii: (0.0, radius),
-                sweep: TAU,
-            },
+            Face::Disc { centre: base, normal: DVec3::Z, radius },
         ],
         edges: vec![Line::Arc(base, DVec3::Z, DVec3::X * radius, TAU)],
         borders: Vec::new(),
@@ -262,13 +251,7 @@ pub fn cylinder(radius: f64, height: f64) -> Solid {
         radii: (radius, radius),
         sweep: TAU,
     };
-    solid.faces.push(Face::Round {
-        base: DVec3::Z * (0.5 * height),
-        axis: DVec3::Z * 1e-9,
-        start: DVec3::X,
-        radii: (0.0, radius),
-        sweep: TAU,
-    });
+    solid.faces.push(Face::Disc { centre: DVec3::Z * (0.5 * height), normal: DVec3::Z, radius });
     solid.edges.push(Line::Arc(
         DVec3::Z * (0.5 * height),
         DVec3::Z,
