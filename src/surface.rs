@@ -23,6 +23,7 @@ use std::borrow::Cow;
 
 use glam::{DMat3, DVec3, Vec3};
 
+use crate::points::moments::Moments;
 use crate::points::{Neighbors, PointCloud};
 
 pub use baseline::{SmoothSurface, plane_normals, weighted_plane_normals};
@@ -277,7 +278,9 @@ impl<'a> Surface<'a> {
     fn smooth_outcome(&self, scratch: &mut Scratch) -> Option<Outcome> {
         let hood = &scratch.hood;
         let smoothing = self.smoothing(hood.radius_mm());
-        let start = levin::weighted_normal(&hood.points, DVec3::ZERO, smoothing.h_mm)?;
+        let mut moments = Moments::default();
+        hood.points.iter().for_each(|p| moments.add(*p));
+        let start = moments.plane().normal;
         let (local, foot) = levin::project(&hood.points, DVec3::ZERO, start, &smoothing)?;
         let limit = 1.25 * self.scale.noise_mm + self.scale.floor_mm();
         if local.polynomial.residual_mm > limit || foot.position.length() > 3.5 * limit {

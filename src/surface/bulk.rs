@@ -62,6 +62,8 @@ struct Landed {
     index: u32,
     position: DVec3,
     normal: Vec3,
+    /// As [`Surface`] keeps it.
+    trust: u8,
     state: State,
 }
 
@@ -146,19 +148,13 @@ pub(super) fn prepare(surface: &mut Surface, mut sink: Option<Sink>) -> Vec<u32>
         for point in landed {
             let index = point.index as usize;
             surface.normals[index] = point.normal;
+            surface.trust[index] = point.trust;
             if point.state == State::Suspicious {
                 suspicious.push(point.index);
             } else if let Some(sink) = &mut sink {
                 sink.positions[index] = point.position;
                 sink.projected[index] = true;
             }
-        }
-    }
-    for block in suspicious.chunks(BLOCK) {
-        let looked = in_parallel(block, |index, scratch| surface.second_look(index, scratch));
-        for (&index, (normal, trust)) in block.iter().zip(looked) {
-            surface.normals[index as usize] = normal;
-            surface.trust[index as usize] = trust;
         }
     }
     suspicious
@@ -178,28 +174,24 @@ impl Surface<'_> {
     fn first_look(&self, index: u32, scratch: &mut Scratch) -> Landed {
         let p = self.positions[index as usize];
         self.gather(p, self.scale.points, scratch);
-        match self.smooth_outcome(scratch) {
-            Some(outcome) => Landed {
+        if let Some(outcome) = self.smooth_outcome(scratch) {
+            return Landed {
                 index,
                 position: p + outcome.nearest.position,
                 normal: outcome.nearest.normals[0].as_vec3(),
+                trust: u8::MAX,
                 state: State::Smooth,
-            },
-            None => Landed {
-                index,
-                position: p,
-                normal: Vec3::ZERO,
-                state: State::Suspicious,
-            },
+            };
         }
-    }
-
-    fn second_look(&self, index: u32, scratch: &mut Scratch) -> (Vec3, u8) {
-        let p = self.positions[index as usize];
-        self.gather(p, self.scale.points_near(), scratch);
-        match robust_normal(&scratch.hood.points, &self.scale) {
-            Some((normal, trust)) => (normal.as_vec3(), (trust * 255.0) as u8),
-            None => (Vec3::Z, 0),
+        let near = scratch.hood.points.len().min(self.scale.points_near());
+        let found = robust_normal(&scratch.hood.points[..near], &self.scale);
+        let (normal, trust) = found.map_or((Vec3::Z, 0), |(n, t)| (n.as_vec3(), (t * 255.0) as u8));
+        Landed {
+            index,
+            position: p,
+            normal,
+            trust,
+            state: State::Suspicious,
         }
     }
 
@@ -242,6 +234,7 @@ impl Features {
                         index,
                         position: p,
                         normal: Vec3::ZERO,
+                        trust: 0,
                         state: State::Lost,
                     });
                     continue;
@@ -257,6 +250,7 @@ impl Features {
                     index,
                     position: p + nearest.position,
                     normal: nearest.normals[0].as_vec3(),
+                    trust: u8::MAX,
                     state: State::Smooth,
                 });
             }

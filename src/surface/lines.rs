@@ -77,14 +77,14 @@ pub(super) fn agree(sightings: Vec<LinePoint>, spacing_mm: f64) -> Vec<LinePoint
         for sighting in &sightings {
             if taken
                 .around(sighting.position)
-                .any(|(q, ())| q.distance(sighting.position) < 0.8 * spacing_mm)
+                .any(|(q, ())| q.distance(sighting.position) < 0.7 * spacing_mm)
             {
                 continue;
             }
             let Some(sample) = mean(sighting, (&sightings, &all), reach) else {
                 continue;
             };
-            if taken.take(sample.position, 0.8 * spacing_mm) {
+            if taken.take(sample.position, 0.7 * spacing_mm) {
                 samples.push(sample);
             }
         }

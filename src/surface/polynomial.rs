@@ -179,6 +179,14 @@ impl Equations {
         })
     }
 
+    /// Weighted sum of the squared residuals of the solution `polynomial`, nothing shrunk, mm².
+    pub fn residual_squares(&self, polynomial: &Polynomial) -> f64 {
+        let explained: f64 = (polynomial.coefficients.iter().zip(&self.right))
+            .map(|(c, r)| c * r)
+            .sum();
+        (self.heights - explained).max(0.0)
+    }
+
     fn cholesky(&self, terms: usize) -> Option<[[f64; TERMS_MAX]; TERMS_MAX]> {
         let mut lower = [[0.0; TERMS_MAX]; TERMS_MAX];
         for i in 0..terms {
@@ -354,6 +362,19 @@ impl Jet {
     /// Unit normal of the graph, in the local frame, on the side of its third axis.
     pub fn normal(&self) -> DVec3 {
         DVec3::new(-self.gradient.x, -self.gradient.y, 1.0).normalize()
+    }
+
+    /// Unit direction, in the frame's plane, in which the second derivative is largest in magnitude.
+    pub fn steepest_bend(&self) -> DVec2 {
+        let [a, b, c] = self.second;
+        let angle = 0.5 * (2.0 * b).atan2(a - c);
+        let first = DVec2::from_angle(angle);
+        let bend = |d: DVec2| (a * d.x * d.x + 2.0 * b * d.x * d.y + c * d.y * d.y).abs();
+        if bend(first) >= bend(first.perp()) {
+            first
+        } else {
+            first.perp()
+        }
     }
 
     /// Principal curvatures, 1/mm, the larger magnitude first; positive where the surface bends towards its normal.

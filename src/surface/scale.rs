@@ -27,7 +27,11 @@ impl Scale {
     /// rests on a part of the points that is at most three times as dense along the lines as across, and every point is still projected.
     pub fn of(cloud: &PointCloud, neighbors: &Neighbors) -> Self {
         let spacing = spacing(cloud, neighbors);
-        let noise_mm = noise_mm(cloud, neighbors, &spacing);
+        let mut noise_mm = noise_mm(cloud, neighbors, &spacing);
+        if !spacing.in_lines() {
+            // Where two sheets lie closer than a neighbourhood everywhere, the distance between them passes for noise.
+            noise_mm = noise_mm.min(1.5 * super::robust::noise_of_planes_mm(cloud, neighbors));
+        }
         let thinning_mm = if spacing.along_mm < LINE_PART * spacing.across_mm {
             LINE_PART * spacing.across_mm
         } else {
