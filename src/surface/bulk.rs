@@ -173,7 +173,7 @@ fn in_parallel<T: Send>(block: &[u32], work: impl Fn(u32, &mut Scratch) -> T + S
 impl Surface<'_> {
     fn first_look(&self, index: u32, scratch: &mut Scratch) -> Landed {
         let p = self.positions[index as usize];
-        self.gather(p, self.scale.points, scratch);
+        self.gather_places(p, self.scale.points, scratch);
         if let Some(outcome) = self.smooth_outcome(scratch) {
             return Landed {
                 index,

@@ -179,7 +179,7 @@ impl Neighborhood {
         let sigma = scale.noise_mm + scale.floor_mm();
         for label in 0..flanks.len() {
             if flanks.len() == FLANKS_MAX
-                || flanks[label].local.polynomial.residual_mm < 1.08 * sigma
+                || flanks[label].local.polynomial.residual_mm < 1.15 * sigma
             {
                 continue;
             }
@@ -282,10 +282,7 @@ fn roof(points: &[DVec3], frame: &LocalFrame, sigma_mm: f64) -> Option<[LocalSur
         .fold(f64::MIN_POSITIVE, f64::max);
     let fit_all = |degree: Degree, pick: &dyn Fn(&DVec3) -> bool| {
         let mut equations = Equations::new(degree, scale_mm);
-        inside
-            .iter()
-            .filter(|p| pick(p))
-            .for_each(|p| equations.add(*p, 1.0));
+        equations.add_all(inside.iter().filter(|p| pick(p)).map(|p| (*p, 1.0)));
         equations
             .solve(0.0)
             .map(|polynomial| (polynomial, equations.residual_squares(&polynomial)))

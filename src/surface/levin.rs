@@ -170,10 +170,10 @@ pub(crate) fn fit(
 
 fn equations(points: &[DVec3], frame: &LocalFrame, smoothing: &Smoothing) -> Equations {
     let mut equations = Equations::new(smoothing.degree, smoothing.h_mm);
-    for p in points {
+    equations.add_all(points.iter().map(|p| {
         let at = frame.inside(*p);
-        equations.add(at, gaussian(at.length_squared(), smoothing.h_mm));
-    }
+        (at, gaussian(at.length_squared(), smoothing.h_mm))
+    }));
     equations
 }
 

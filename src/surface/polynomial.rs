@@ -97,31 +97,44 @@ impl Equations {
         }
     }
 
-    /// Adds one point given in the local frame.
-    #[inline]
-    pub fn add(&mut self, at: DVec3, weight: f64) {
+    /// Adds points given in the local frame, with weights.
+    pub fn add_all(&mut self, points: impl Iterator<Item = (DVec3, f64)>) {
         match self.terms {
-            3 => self.add_terms::<3>(at, weight),
-            6 => self.add_terms::<6>(at, weight),
-            _ => self.add_terms::<10>(at, weight),
+            3 => self.add_terms::<3>(points),
+            6 => self.add_terms::<6>(points),
+            _ => self.add_terms::<10>(points),
         }
     }
 
     #[inline]
-    fn add_terms<const T: usize>(&mut self, at: DVec3, weight: f64) {
+    fn add_terms<const T: usize>(&mut self, points: impl Iterator<Item = (DVec3, f64)>) {
         let inverse = 1.0 / self.scale_mm;
-        let phi = monomials(at.x * inverse, at.y * inverse);
-        for i in 0..T {
-            let row = weight * phi[i];
-            for j in 0..=i {
-                self.matrix[i][j] += row * phi[j];
+        let mut matrix = [[0.0; T]; T];
+        let mut right = [0.0; T];
+        for (at, weight) in points {
+            let phi = monomials(at.x * inverse, at.y * inverse);
+            // All of the square rather than half: the compiler works on two columns at once.
+            for i in 0..T {
+                let row = weight * phi[i];
+                for j in 0..T {
+                    matrix[i][j] += row * phi[j];
+                }
             }
-            self.right[i] += row * at.z;
+            let height = weight * at.z;
+            for i in 0..T {
+                right[i] += height * phi[i];
+            }
+            self.heights += height * at.z;
+            self.weights += weight;
+            self.weights_squared += weight * weight;
+            self.count += 1;
         }
-        self.heights += weight * at.z * at.z;
-        self.weights += weight;
-        self.weights_squared += weight * weight;
-        self.count += 1;
+        for i in 0..T {
+            for j in 0..T {
+                self.matrix[i][j] += matrix[i][j];
+            }
+            self.right[i] += right[i];
+        }
     }
 
     /// The polynomial of least squares, its higher degrees shrunk as far as noise of `sigma_mm` would make them.
