@@ -107,6 +107,28 @@ fn row(trial: &Trial) {
     let seconds = start.elapsed().as_secs_f64();
     let search = 0.5 * (search + neighbour_search(&cloud.positions, &neighbors, 20));
     let f = trial.figures(&result);
+    if std::env::var_os("DEBUG").is_some() {
+        let mut by: std::collections::BTreeMap<(usize, usize), usize> = Default::default();
+        for (i, p) in trial.seen.iter().enumerate() {
+            if !result.projected[i] {
+                *by.entry((
+                    p.face,
+                    (trial.body.edge_distance(p.clean) / trial.unit_mm).floor() as usize,
+                ))
+                .or_default() += 1;
+            }
+        }
+        println!("{by:?}");
+        for l in &result.lines {
+            let d = trial.body.edge_distance(l.position) / trial.unit_mm;
+            if d > 0.5 {
+                println!(
+                    "line {:?} {:?} {:.2} {:?}",
+                    l.position, l.place, d, l.normals
+                );
+            }
+        }
+    }
     println!(
         "{:<34}{:>8.4}{:>8.4}{:>8.4}{:>8.4}{:>8.3}{:>8.3}{:>8.3}{:>8.4}{:>7.2}{:>7.2}{:>7.2}{:>8.4}{:>8.3}{:>7}{:>8.2}{:>7.1}",
         trial.name,

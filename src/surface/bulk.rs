@@ -4,9 +4,11 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::flank::Nearest;
-use super::lines;
+use super::lines::{self, Sighting};
 use super::robust::robust_normal;
-use super::{LINE_SPACING, Meetings, Place, Scale, Scratch, Settings, Surface, SurfaceError};
+use super::{
+    LINE_SPACING, Meetings, Outcome, Place, Scale, Scratch, Settings, Surface, SurfaceError,
+};
 use crate::points::{Neighbors, PointCloud};
 
 /// Points whose results are held at once, before they go to their places.
@@ -184,7 +186,10 @@ impl Surface<'_> {
             };
         }
         let near = scratch.hood.points.len().min(self.scale.points_near());
-        let found = robust_normal(&scratch.hood.points[..near], &self.scale);
+        // Where scan lines lie far apart the nearest points are all on one of them: then all have their say.
+        let found = robust_normal(&scratch.hood.points[..near], &self.scale)
+            .filter(|(_, trust)| *trust > 0.25)
+            .or_else(|| robust_normal(&scratch.hood.points, &self.scale));
         let (normal, trust) = found.map_or((Vec3::Z, 0), |(n, t)| (n.as_vec3(), (t * 255.0) as u8));
         Landed {
             index,
@@ -205,7 +210,7 @@ impl Surface<'_> {
 #[derive(Default)]
 struct Features {
     sharp: Vec<SharpPoint>,
-    lines: Vec<LinePoint>,
+    lines: Vec<Sighting>,
 }
 
 impl Features {
@@ -228,7 +233,10 @@ impl Features {
             for (&index, (nearest, meetings)) in block.iter().zip(landed) {
                 let p = cloud.positions[index as usize];
                 self.lines
-                    .extend(meetings.iter().flatten().map(|m| line_point(p, m)));
+                    .extend(meetings.iter().flatten().map(|m| Sighting {
+                        line: line_point(p, m),
+                        distance: m.position.length() / surface.scale.spacing_mm,
+                    }));
                 let Some(nearest) = nearest else {
                     put(Landed {
                         index,
@@ -286,22 +294,20 @@ fn land_one(
         surface.gather(p, surface.scale.points_wide(), scratch);
         surface.sharp_outcome(scratch)
     };
+    let longest = surface.longest_way_mm();
+    let fits = |outcome: &Outcome| outcome.nearest.position.length() <= longest;
+    // On a face that the rays graze the scan lines lie several times farther apart than elsewhere: then a wider look helps.
+    let outcome = outcome.filter(fits).or_else(|| {
+        surface.gather(p, 3 * surface.scale.points_wide(), scratch);
+        surface.sharp_outcome(scratch).filter(fits)
+    });
     let Some(outcome) = outcome else {
         return (None, Meetings::default());
     };
-    let longest = surface.longest_way_mm();
     // Lines are sampled from as far as the flanks' own points reach beyond doubt.
     let near = longest + 1.5 * surface.scale.spacing_mm;
     let meetings = outcome
         .meetings
         .map(|m| m.filter(|m| m.position.length() < near));
-    let nearest = Some(outcome.nearest).filter(|n| n.position.length() <= longest);
-    (
-        nearest,
-        if nearest.is_some() {
-            meetings
-        } else {
-            Meetings::default()
-        },
-    )
+    (Some(outcome.nearest), meetings)
 }

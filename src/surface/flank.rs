@@ -270,7 +270,7 @@ impl Neighborhood {
 /// The two planes that explain the points better than a quadric over `frame`, by more than chance would under noise of `sigma_mm`.
 fn roof(points: &[DVec3], frame: &LocalFrame, sigma_mm: f64) -> Option<[LocalSurface; 2]> {
     /// Residual squares, in squares of sigma, that two planes must take away: chance does so once in hundreds of neighbourhoods.
-    const GAIN: f64 = 10.0;
+    const GAIN: f64 = 14.0;
     const LEAST: usize = 6;
     if points.len() < 3 * LEAST {
         return None;
