@@ -73,7 +73,7 @@ fn main() {
         trials.retain(|t| t.name.contains(only));
     }
     println!(
-        "{:<34}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>7}{:>7}{:>7}{:>8}{:>8}{:>7}{:>8}",
+        "{:<34}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>7}{:>7}{:>7}{:>8}{:>8}{:>7}{:>8}{:>7}",
         "cloud",
         "in flat",
         "in edge",
@@ -89,7 +89,8 @@ fn main() {
         "line",
         "l worst",
         "lines",
-        "seconds"
+        "seconds",
+        "ratio"
     );
     for trial in &trials {
         row(trial);
@@ -99,13 +100,37 @@ fn main() {
 fn row(trial: &Trial) {
     let cloud = figures::cloud_of(&trial.seen);
     let neighbors = acies::points::Neighbors::new(&cloud.positions);
+    let search = neighbour_search(&cloud.positions, &neighbors, 20);
     let start = std::time::Instant::now();
     let result = acies::surface::reconstruct(&cloud, &neighbors, Settings::default())
         .expect("enough points");
     let seconds = start.elapsed().as_secs_f64();
+    let search = 0.5 * (search + neighbour_search(&cloud.positions, &neighbors, 20));
     let f = trial.figures(&result);
+    if std::env::var_os("DEBUG").is_some() {
+        let mut by: std::collections::BTreeMap<(usize, usize), usize> = Default::default();
+        for (i, p) in trial.seen.iter().enumerate() {
+            if !result.projected[i] {
+                *by.entry((
+                    p.face,
+                    (trial.body.edge_distance(p.clean) / trial.unit_mm).floor() as usize,
+                ))
+                .or_default() += 1;
+            }
+        }
+        println!("{by:?}");
+        for l in &result.lines {
+            let d = trial.body.edge_distance(l.position) / trial.unit_mm;
+            if d > 0.5 {
+                println!(
+                    "line {:?} {:?} {:.2} {:?}",
+                    l.position, l.place, d, l.normals
+                );
+            }
+        }
+    }
     println!(
-        "{:<34}{:>8.4}{:>8.4}{:>8.4}{:>8.4}{:>8.3}{:>8.3}{:>8.3}{:>8.4}{:>7.2}{:>7.2}{:>7.2}{:>8.4}{:>8.3}{:>7}{:>8.2}   {:?}",
+        "{:<34}{:>8.4}{:>8.4}{:>8.4}{:>8.4}{:>8.3}{:>8.3}{:>8.3}{:>8.4}{:>7.2}{:>7.2}{:>7.2}{:>8.4}{:>8.3}{:>7}{:>8.2}{:>7.1}",
         trial.name,
         f.input_flat,
         f.input_edge,
@@ -122,6 +147,30 @@ fn row(trial: &Trial) {
         f.line_worst,
         f.lines,
         seconds,
-        result.scale
+        seconds / search,
     );
+}
+
+/// Seconds for the `k` nearest neighbours of all points, the reference of all times here.
+fn neighbour_search(
+    positions: &[glam::DVec3],
+    neighbors: &acies::points::Neighbors,
+    k: usize,
+) -> f64 {
+    use rayon::prelude::*;
+    let start = std::time::Instant::now();
+    let far: f64 = neighbors
+        .order()
+        .par_chunks(256)
+        .map_init(Vec::new, |found, part| {
+            let mut far = 0.0f64;
+            for &i in part {
+                neighbors.nearest(positions[i as usize], k, found);
+                far = far.max(found.last().map_or(0.0, |f| f.1));
+            }
+            far
+        })
+        .reduce(|| 0.0, f64::max);
+    assert!(far > 0.0);
+    start.elapsed().as_secs_f64()
 }

@@ -97,31 +97,44 @@ impl Equations {
         }
     }
 
-    /// Adds one point given in the local frame.
-    #[inline]
-    pub fn add(&mut self, at: DVec3, weight: f64) {
+    /// Adds points given in the local frame, with weights.
+    pub fn add_all(&mut self, points: impl Iterator<Item = (DVec3, f64)>) {
         match self.terms {
-            3 => self.add_terms::<3>(at, weight),
-            6 => self.add_terms::<6>(at, weight),
-            _ => self.add_terms::<10>(at, weight),
+            3 => self.add_terms::<3>(points),
+            6 => self.add_terms::<6>(points),
+            _ => self.add_terms::<10>(points),
         }
     }
 
     #[inline]
-    fn add_terms<const T: usize>(&mut self, at: DVec3, weight: f64) {
+    fn add_terms<const T: usize>(&mut self, points: impl Iterator<Item = (DVec3, f64)>) {
         let inverse = 1.0 / self.scale_mm;
-        let phi = monomials(at.x * inverse, at.y * inverse);
-        for i in 0..T {
-            let row = weight * phi[i];
-            for j in 0..=i {
-                self.matrix[i][j] += row * phi[j];
+        let mut matrix = [[0.0; T]; T];
+        let mut right = [0.0; T];
+        for (at, weight) in points {
+            let phi = monomials(at.x * inverse, at.y * inverse);
+            // All of the square rather than half: the compiler works on two columns at once.
+            for i in 0..T {
+                let row = weight * phi[i];
+                for j in 0..T {
+                    matrix[i][j] += row * phi[j];
+                }
             }
-            self.right[i] += row * at.z;
+            let height = weight * at.z;
+            for i in 0..T {
+                right[i] += height * phi[i];
+            }
+            self.heights += height * at.z;
+            self.weights += weight;
+            self.weights_squared += weight * weight;
+            self.count += 1;
         }
-        self.heights += weight * at.z * at.z;
-        self.weights += weight;
-        self.weights_squared += weight * weight;
-        self.count += 1;
+        for i in 0..T {
+            for j in 0..T {
+                self.matrix[i][j] += matrix[i][j];
+            }
+            self.right[i] += right[i];
+        }
     }
 
     /// The polynomial of least squares, its higher degrees shrunk as far as noise of `sigma_mm` would make them.
@@ -177,6 +190,14 @@ impl Equations {
             coefficients,
             residual_mm,
         })
+    }
+
+    /// Weighted sum of the squared residuals of the solution `polynomial`, nothing shrunk, mm².
+    pub fn residual_squares(&self, polynomial: &Polynomial) -> f64 {
+        let explained: f64 = (polynomial.coefficients.iter().zip(&self.right))
+            .map(|(c, r)| c * r)
+            .sum();
+        (self.heights - explained).max(0.0)
     }
 
     fn cholesky(&self, terms: usize) -> Option<[[f64; TERMS_MAX]; TERMS_MAX]> {
@@ -354,6 +375,19 @@ impl Jet {
     /// Unit normal of the graph, in the local frame, on the side of its third axis.
     pub fn normal(&self) -> DVec3 {
         DVec3::new(-self.gradient.x, -self.gradient.y, 1.0).normalize()
+    }
+
+    /// Unit direction, in the frame's plane, in which the second derivative is largest in magnitude.
+    pub fn steepest_bend(&self) -> DVec2 {
+        let [a, b, c] = self.second;
+        let angle = 0.5 * (2.0 * b).atan2(a - c);
+        let first = DVec2::from_angle(angle);
+        let bend = |d: DVec2| (a * d.x * d.x + 2.0 * b * d.x * d.y + c * d.y * d.y).abs();
+        if bend(first) >= bend(first.perp()) {
+            first
+        } else {
+            first.perp()
+        }
     }
 
     /// Principal curvatures, 1/mm, the larger magnitude first; positive where the surface bends towards its normal.
