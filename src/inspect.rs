@@ -102,7 +102,7 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     };
     let measured = measure_edges(&part, &places, &surface, &settings);
     stages.begin("comparison of edges found");
-    let detection = features::detect(&part, &neighbors, Method::Adaptive);
+    let detection = features::detect(cloud, &neighbors, Method::Adaptive);
     let edges = nominal.edges();
     let compared = compare::compare(&part, &detection, nominal, (&edges, &measured));
 
