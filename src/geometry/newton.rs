@@ -85,6 +85,9 @@ const MAX_HALVINGS: usize = 12;
 /// A step shorter than this share of the coordinates is rounding.
 const ROUNDING: f64 = 1e-14;
 
+/// After a Newton step shorter than this share of the coordinates, what is left is its square: rounding.
+const LAST_STEP: f64 = 1e-8;
+
 /// The parameter of a local nearest point of a curve, reached downhill from `start`, and its squared distance.
 pub fn nearest_on_curve(
     curve: impl Fn(f64) -> [DVec3; 3],
@@ -108,6 +111,14 @@ pub fn nearest_on_curve(
             || step * step * speed2 <= resolution * resolution
             || range.blocks(t, step)
         {
+            break;
+        }
+        if step * step * speed2 <= (resolution * (LAST_STEP / ROUNDING)).powi(2) {
+            let next = range.bring(t + step);
+            let last = curve(next)[0].distance_squared(p);
+            if level(last, d2) {
+                (t, d2) = (next, last.min(d2));
+            }
             break;
         }
         let mut moved = false;
@@ -144,6 +155,17 @@ pub fn nearest_on_surface(
         let resolution = ROUNDING * (at.point.length() + p.length());
         let length = at.du.length() * step.x.abs() + at.dv.length() * step.y.abs();
         if !step.is_finite() || length <= resolution {
+            break;
+        }
+        if length <= resolution * (LAST_STEP / ROUNDING) {
+            let next = (
+                ranges[0].bring(uv.0 + step.x),
+                ranges[1].bring(uv.1 + step.y),
+            );
+            let last = surface(next.0, next.1).point.distance_squared(p);
+            if level(last, d2) {
+                (uv, d2) = (next, last.min(d2));
+            }
             break;
         }
         // A coupled step that is cut at an end may lead uphill; down the slope, each parameter by itself, never does.
