@@ -2,6 +2,7 @@
 
 mod check;
 mod demo;
+mod detect;
 mod devices;
 mod inspect;
 mod nominal;
@@ -24,6 +25,8 @@ pub enum Command {
     Demo(demo::Demo),
     /// Measure every sharp edge of a scan against its nominal.
     Inspect(inspect::Inspect),
+    /// Find the points of a scan that lie on sharp edges, corners and boundaries.
+    Detect(detect::Detect),
     /// Project a scan onto its surface, keeping edges sharp.
     Reconstruct(reconstruct::Reconstruct),
     /// Say what a CAD file holds: faces, edges, sharp edges, and what was refused.
@@ -45,6 +48,7 @@ impl Command {
         match self {
             Command::Demo(command) => command.run(),
             Command::Inspect(command) => command.run(),
+            Command::Detect(command) => command.run(),
             Command::Reconstruct(command) => command.run(),
             Command::Nominal(command) => command.run(),
             Command::Check(command) => command.run(),
