@@ -14,6 +14,8 @@ mod lines;
 mod patch;
 pub mod profile;
 mod tangent;
+pub mod thesis;
+pub mod variation;
 
 use adaptive::{Places, Sights, THIN};
 use tangent::Tangents;
@@ -84,8 +86,19 @@ pub fn detect(cloud: &PointCloud, neighbors: &Neighbors, method: Method) -> Dete
             .push("points: fewer than 8 distinct places, no edge can be told".to_owned());
         return detection;
     }
-    let _ = method;
-    adaptive(cloud, neighbors, &mut detection, &mut clock);
+    match method {
+        Method::Adaptive => adaptive(cloud, neighbors, &mut detection, &mut clock),
+        Method::Global => {
+            let settings = thesis::Settings::global();
+            detection.classes = thesis::detect_as_in_thesis(cloud, neighbors, &settings);
+            clock.lap("clusters");
+        }
+        Method::Variation => {
+            let settings = variation::Settings::default();
+            detection.classes = variation::detect_by_variation(cloud, neighbors, &settings);
+            clock.lap("variation");
+        }
+    }
     detection.seconds = clock.laps;
     detection
 }
