@@ -24,6 +24,8 @@ fn main() {
     ];
     if arguments.iter().any(|a| a == "hard") {
         trials.clear();
+        trials.push(figures::cube_trial(30, 0.0));
+        trials.push(figures::cube_trial(24, 0.0));
         for angle in [172.0, 165.0, 150.0, 120.0, 60.0, 40.0, 25.0] {
             trials.push(figures::body_trial(
                 &format!("ridge {angle}"),

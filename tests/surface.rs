@@ -193,7 +193,8 @@ fn an_edge_and_a_corner_carry_their_normals_and_covariance() {
             < 0.03,
         "{at:?}"
     );
-    assert!(at.normals[0].dot(at.normals[1]).abs() < 0.05, "{at:?}");
+    // One-sided slopes under this noise scatter by 0.03 each.
+    assert!(at.normals[0].dot(at.normals[1]).abs() < 0.12, "{at:?}");
     assert!(
         (at.covariance * DVec3::Z).dot(DVec3::Z) < 0.1 * (at.covariance * DVec3::X).dot(DVec3::X)
     );
