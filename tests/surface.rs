@@ -46,6 +46,7 @@ fn a_clean_cube_with_hole_stays_where_it_is() {
         "{f:?}"
     );
     assert!(f.projected == 1.0 && f.worst < 0.05, "{f:?}");
+    assert!(f.line_worst < 0.05, "no line where there is no edge: {f:?}");
     let corners = result
         .lines
         .iter()
