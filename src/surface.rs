@@ -293,7 +293,7 @@ impl<'a> Surface<'a> {
         hood.points.iter().for_each(|p| moments.add(*p));
         let start = moments.plane().normal;
         let (local, foot) = levin::project(&hood.points, DVec3::ZERO, start, &smoothing)?;
-        let limit = 1.35 * self.scale.noise_mm + self.scale.floor_mm();
+        let limit = 1.35 * self.scale.noise_mm + 3.5 * self.scale.floor_mm();
         if local.polynomial.residual_mm > limit || foot.position.length() > 3.5 * limit {
             return None;
         }

@@ -128,7 +128,7 @@ impl Neighborhood {
         };
         let mut wide = *smoothing;
         let mut flank = None;
-        for (stride, bend) in [(0.5, 0.04), (0.9, 0.02), (2.0, 0.01)] {
+        for (stride, bend) in [(0.5, 0.1), (0.9, 0.03), (2.0, 0.01)] {
             let reach = stride * radius;
             self.members.clear();
             let mut last = Vec::new();
@@ -194,7 +194,7 @@ impl Neighborhood {
 
     /// Gives every neighbour to the flank that explains its position and its normal best.
     fn choose(&mut self, flanks: &[Flank], scale: &Scale) {
-        let width = scale.noise_mm + 2.0 * scale.floor_mm();
+        let width = scale.noise_mm + 3.0 * scale.floor_mm();
         for i in 0..self.points.len() {
             let mut best = (NONE, 16.0);
             for (label, flank) in flanks.iter().enumerate() {
@@ -308,6 +308,11 @@ fn roof(points: &[DVec3], frame: &LocalFrame, sigma_mm: f64) -> Option<[LocalSur
         if one.1 + other.1 < best.0 {
             best = (one.1 + other.1, Some([one.0, other.0]));
         }
+    }
+    // Planes that do not explain the points down to the noise are no better than facets of a curved surface.
+    let limit = 1.3 * sigma_mm;
+    if best.0 > points.len() as f64 * limit * limit {
+        return None;
     }
     best.1.map(|planes| {
         planes.map(|polynomial| LocalSurface {

@@ -197,11 +197,14 @@ impl LocalSurface {
         (at.z - jet.height) / (1.0 + jet.gradient.length_squared()).sqrt()
     }
 
-    /// Variance, mm², of the surface's height at `foot` under noise of `sigma_mm` along the normal: that of a linear estimate with
-    /// these weights, the shrinking left out.
+    /// Variance, mm², of the surface at `foot` along its normal, under noise of `sigma_mm`: that of the unshrunk estimate, which is linear
+    /// in the points, and the square of what the shrinking changed, for the bias that it may have brought in.
     pub fn variance(&self, points: &[DVec3], foot: &Foot, smoothing: &Smoothing) -> Option<f64> {
         let terms = self.polynomial.terms();
-        let inverse = equations(points, &self.frame, smoothing).inverse(terms)?;
+        let equations = equations(points, &self.frame, smoothing);
+        let inverse = equations.inverse(terms)?;
+        let unshrunk = equations.solve(0.0)?;
+        let changed = unshrunk.height(foot.inside.x, foot.inside.y) - foot.inside.z;
         let scale = smoothing.h_mm;
         let at = super::polynomial::monomials(foot.inside.x / scale, foot.inside.y / scale);
         let mut row = [0.0; super::polynomial::TERMS_MAX];
@@ -218,7 +221,7 @@ impl LocalSurface {
         }
         // Heights run along the frame's normal, the surface's own is tilted against it.
         Some(
-            sum * smoothing.sigma_mm * smoothing.sigma_mm
+            (sum * smoothing.sigma_mm * smoothing.sigma_mm + changed * changed)
                 / (1.0 + foot.jet.gradient.length_squared()),
         )
     }

@@ -139,9 +139,9 @@ impl Equations {
 
     /// The polynomial of least squares, its higher degrees shrunk as far as noise of `sigma_mm` would make them.
     ///
-    /// The part of a degree above one is multiplied by 1 - n s² / q (not below 0), with n its number of terms, s² the noise and q what
-    /// it takes off the sum of squares: positive-part James-Stein. On a plane the fit so becomes nearly that of a plane, with its
-    /// small variance; where the surface curves, nothing changes. Degrees that the points cannot determine are left out; `None` where
+    /// The part of a degree above one is multiplied by 1 - 2 (n - 2) s² / q (not below 0), with n its number of terms, s² the noise and q
+    /// what it takes off the sum of squares: positive-part James-Stein, as strong as it may be without ever being worse than no
+    /// shrinking. On a plane the fit so becomes more like that of a plane, with its small variance; where the surface curves, little changes. Degrees that the points cannot determine are left out; `None` where
     /// they do not even determine a plane.
     pub fn solve(&self, sigma_mm: f64) -> Option<Polynomial> {
         let mut terms = self.terms;
@@ -252,7 +252,7 @@ fn shrink(y: &mut [f64], variance: f64) {
         let Some(part) = y.get_mut(group) else { return };
         let taken: f64 = part.iter().map(|v| v * v).sum();
         let factor = if taken > 0.0 {
-            (1.0 - part.len() as f64 * variance / taken).max(0.0)
+            (1.0 - 2.0 * (part.len() as f64 - 2.0) * variance / taken).max(0.0)
         } else {
             0.0
         };

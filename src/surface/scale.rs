@@ -75,7 +75,7 @@ impl Scale {
 /// Points of one projection for a ratio of noise to spacing: enough that a quadric's height at the centre has a third of the noise at a
 /// ratio of 0.1, more where there is more, fewer where nothing needs to be averaged.
 fn points_for(ratio: f64) -> usize {
-    (26.0 + 180.0 * ratio.clamp(0.0, 0.4)) as usize
+    (26.0 + 180.0 * ratio.clamp(0.0, 0.4) + 150.0 * (ratio.min(0.4) - 0.15).max(0.0)) as usize
 }
 
 /// Indices of the points that support the surface, in the order of `neighbors`: no two closer than `distance_mm`.
