@@ -348,6 +348,10 @@ fn gap_text(gap: &FlankGap) -> String {
         FlankGap::ShortReach(first, last) => format!(
             "points only {first:.3} to {last:.3} mm from the edge, too short a reach to extrapolate"
         ),
+        FlankGap::Turned(angle_rad) => format!(
+            "turned by {:.0} degrees against the face: an edge break or another surface",
+            angle_rad.to_degrees()
+        ),
     }
 }
 
