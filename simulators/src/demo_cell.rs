@@ -289,7 +289,8 @@ fn stand(from: DVec3) -> (Pose, u32) {
         }
     }
     let middle = 0.5 * (low + high);
-    let origin = rotation.x_axis * middle.x + z * (middle.y - STANDOFF_MM) + AXIS * (low.z - MARGIN_MM);
+    let origin =
+        rotation.x_axis * middle.x + z * (middle.y - STANDOFF_MM) + AXIS * (low.z - MARGIN_MM);
     let travel = high.z - low.z + 2.0 * MARGIN_MM;
     let profiles = (travel / (MM_PER_COUNT * STEP_COUNTS as f64)).ceil() as u32;
     let translation = (origin * 1000.0).round() / 1000.0;
