@@ -6,10 +6,10 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::Class;
 use super::flanks::{Crease, FAR, Verdict, Workshop, overlooked_turn};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
-use super::Class;
 use crate::points::Neighbors;
 
 /// Points looked at around a candidate, one level after the other as long as the answer is open.
@@ -40,7 +40,6 @@ pub(super) struct Places<'a> {
 pub(super) struct Sight {
     pub foot: DVec3,
     pub tangent: DVec3,
-    pub turn: f64,
     pub sd_mm: f64,
     pub corner: Option<DVec3>,
 }
@@ -49,8 +48,6 @@ pub(super) struct Sight {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Agreed {
     /// From the place to the edge, mm.
-    pub foot: DVec3,
-    pub tangent: DVec3,
     /// From the place to the edge, as a share of the distance at which it is marked.
     pub distance: f64,
     /// The same for the corner.
@@ -154,7 +151,11 @@ impl Places<'_> {
         let apart = APART * reach / 3.57;
         for (_, i) in &shop.ranked {
             let at = shop.flanks.points[*i as usize];
-            if shop.taken.iter().all(|t: &DVec3| t.distance_squared(at) > apart * apart) {
+            if shop
+                .taken
+                .iter()
+                .all(|t: &DVec3| t.distance_squared(at) > apart * apart)
+            {
                 shop.taken.push(at);
                 let plane = &tangents.planes[shop.found[*i as usize].0 as usize];
                 let normal = plane.normal();
@@ -170,7 +171,12 @@ impl Places<'_> {
     }
 
     /// The edge near `p` that the places `around` it agree upon; `unit` is the spacing there, mm.
-    pub fn agree(&self, sights: &Sights, p: DVec3, (around, unit): (&[u32], f64)) -> Option<Agreed> {
+    pub fn agree(
+        &self,
+        sights: &Sights,
+        p: DVec3,
+        (around, unit): (&[u32], f64),
+    ) -> Option<Agreed> {
         let mut witnesses = [Witness::default(); super::tangent::NEAR];
         let mut seeing = 0;
         for (witness, j) in witnesses.iter_mut().zip(around) {
@@ -190,8 +196,6 @@ impl Places<'_> {
             let distance = at.length() * unit / thin;
             if share >= AGREEMENT && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
-                    foot: at * unit,
-                    tangent: sight.tangent,
                     distance,
                     corner_distance: None,
                 });
@@ -210,9 +214,11 @@ impl Places<'_> {
             Some((self.positions[*j as usize] + c - p) / unit)
         });
         let (mut sum, mut n) = (DVec3::ZERO, 0);
-        let nearest = corners
-            .clone()
-            .fold(DVec3::INFINITY, |a, b| if b.length() < a.length() { b } else { a });
+        let nearest =
+            corners.clone().fold(
+                DVec3::INFINITY,
+                |a, b| if b.length() < a.length() { b } else { a },
+            );
         for c in corners.filter(|c| c.distance_squared(nearest) < 1.5) {
             sum += c;
             n += 1;
@@ -260,7 +266,11 @@ fn fit_feet(witnesses: &[Witness], (foot, tangent): (DVec3, DVec3), unit: f64) -
             }
         }
     }
-    let share = if votes < 3 { 0.0 } else { f64::from(votes) / f64::from(expected) };
+    let share = if votes < 3 {
+        0.0
+    } else {
+        f64::from(votes) / f64::from(expected)
+    };
     // Bending is held back a little, so that few feet give a straight line.
     a[1][1] += 0.02 * a[0][0];
     a[2][2] += 0.1 * a[0][0];
@@ -318,7 +328,6 @@ fn in_mm(crease: Crease, unit: f64) -> Sight {
     Sight {
         foot: crease.foot * unit,
         tangent: crease.tangent,
-        turn: crease.turn,
         sd_mm: crease.sd * unit,
         corner: crease.corner.map(|c| c * unit),
     }

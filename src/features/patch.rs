@@ -92,7 +92,11 @@ impl Surface {
 
     /// Largest curvature at the middle of the fit, for a frame nearly tangent.
     pub fn curvature(&self) -> f64 {
-        let [xx, xy, yy] = [2.0 * self.coefficients[3], self.coefficients[4], 2.0 * self.coefficients[5]];
+        let [xx, xy, yy] = [
+            2.0 * self.coefficients[3],
+            self.coefficients[4],
+            2.0 * self.coefficients[5],
+        ];
         let mean = 0.5 * (xx + yy);
         mean.abs() + (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
     }
@@ -121,7 +125,10 @@ pub(super) fn fit(points: &[DVec3], variance: f64) -> Option<Fit> {
     let cap = 9.0 * variance;
     let simple = Fit {
         surface: Surface::flat(flat, plane.centre),
-        squares: points.iter().map(|p| flat.distance(*p).powi(2).min(cap)).sum(),
+        squares: points
+            .iter()
+            .map(|p| flat.distance(*p).powi(2).min(cap))
+            .sum(),
         count,
         parameters: 3,
     };
@@ -138,7 +145,10 @@ pub(super) fn fit(points: &[DVec3], variance: f64) -> Option<Fit> {
     }
     let bent = Fit {
         surface: curved,
-        squares: points.iter().map(|p| curved.distance(*p).powi(2).min(cap)).sum(),
+        squares: points
+            .iter()
+            .map(|p| curved.distance(*p).powi(2).min(cap))
+            .sum(),
         count,
         parameters: 6,
     };
