@@ -183,7 +183,11 @@ fn in_lines(
     clock.lap("tangent planes");
     let sights = Sights::new(&places, &tangents);
     clock.lap("flanks");
-    let borders = boundary::mark(&places, &tangents, vec![Class::None; places.positions.len()]);
+    let borders = boundary::mark(
+        &places,
+        &tangents,
+        vec![Class::None; places.positions.len()],
+    );
     clock.lap("boundaries");
     let classes = all
         .par_iter()

@@ -149,7 +149,12 @@ fn reading(error: PointsError) -> Failure {
     }
 }
 
-fn write(path: &Path, form: &Form, cloud: &PointCloud, detection: &Detection) -> Result<(), Failure> {
+fn write(
+    path: &Path,
+    form: &Form,
+    cloud: &PointCloud,
+    detection: &Detection,
+) -> Result<(), Failure> {
     let written = match form {
         Form::Ply => {
             let features: Vec<u8> = detection.classes.iter().map(|c| *c as u8).collect();

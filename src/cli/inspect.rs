@@ -133,12 +133,7 @@ impl Inspect {
         inspection
     }
 
-    fn facts(
-        &self,
-        scan: &Read,
-        recipe: Recipe,
-        inspection: &Inspection,
-    ) -> Facts {
+    fn facts(&self, scan: &Read, recipe: Recipe, inspection: &Inspection) -> Facts {
         let estimate = inspection.scan.as_ref();
         let lines = estimate.filter(|e| e.spacing.in_lines());
         Facts {

@@ -6,10 +6,10 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::Class;
 use super::flanks::{Crease, FAR, Verdict, Workshop, overlooked_turn};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
-use super::Class;
 use crate::points::Neighbors;
 
 /// Points looked at around a candidate, one level after the other as long as the answer is open.
@@ -174,7 +174,12 @@ impl Places<'_> {
     }
 
     /// The edge near `p` that the places `around` it agree upon; `unit` is the spacing there, mm.
-    pub fn agree(&self, sights: &Sights, p: DVec3, (around, unit): (&[u32], f64)) -> Option<Agreed> {
+    pub fn agree(
+        &self,
+        sights: &Sights,
+        p: DVec3,
+        (around, unit): (&[u32], f64),
+    ) -> Option<Agreed> {
         let mut witnesses = [Witness::default(); super::tangent::NEAR];
         let mut seeing = 0;
         for (witness, j) in witnesses.iter_mut().zip(around) {

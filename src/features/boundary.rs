@@ -21,17 +21,22 @@ const FELLOWS: usize = 3;
 pub(super) fn mark(places: &Places, tangents: &Tangents, mut classes: Vec<Class>) -> Vec<Class> {
     let open: Vec<bool> = (0..places.positions.len())
         .into_par_iter()
-        .map_init(Vec::new, |angles, rank| is_open(places, tangents, rank, angles))
+        .map_init(Vec::new, |angles, rank| {
+            is_open(places, tangents, rank, angles)
+        })
         .collect();
-    classes.par_iter_mut().enumerate().for_each(|(rank, class)| {
-        if *class == Class::None && open[rank] {
-            let around = tangents.around(rank);
-            let fellows = around.iter().filter(|j| open[**j as usize]).count();
-            if fellows > FELLOWS {
-                *class = Class::Boundary;
+    classes
+        .par_iter_mut()
+        .enumerate()
+        .for_each(|(rank, class)| {
+            if *class == Class::None && open[rank] {
+                let around = tangents.around(rank);
+                let fellows = around.iter().filter(|j| open[**j as usize]).count();
+                if fellows > FELLOWS {
+                    *class = Class::Boundary;
+                }
             }
-        }
-    });
+        });
     classes
 }
 
@@ -41,7 +46,8 @@ fn is_open(places: &Places, tangents: &Tangents, rank: usize, angles: &mut Vec<f
     let reach = f64::from(plane.reach_mm);
     let unit = places.unit_mm(reach, around.len());
     // A stray point off the surface sees all of it in one direction.
-    let stray = f64::from(plane.height_mm).abs() > unit || reach > 6.0 * unit.min(places.spacing_mm);
+    let stray =
+        f64::from(plane.height_mm).abs() > unit || reach > 6.0 * unit.min(places.spacing_mm);
     if stray || around.len() < 8 {
         return false;
     }

@@ -111,7 +111,11 @@ impl Workshop {
         let reach = self.points[n - 1].length();
         let turn = 2.0 * whole.surface.curvature() * reach;
         let smooth = turn < 0.7 * LEAST_TURN || turn > 1.5 * overlooked_turn(variance, n, reach);
-        Some(if smooth { Verdict::Smooth } else { Verdict::Unsure })
+        Some(if smooth {
+            Verdict::Smooth
+        } else {
+            Verdict::Unsure
+        })
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -139,7 +143,13 @@ impl Workshop {
             self.seeds.push(Plane::through(
                 self.near[..k].iter().map(|(_, i)| points[*i as usize]),
             ));
-            at = (0..n).fold(0, |best, i| if self.costs[i] > self.costs[best] { i } else { best });
+            at = (0..n).fold(0, |best, i| {
+                if self.costs[i] > self.costs[best] {
+                    i
+                } else {
+                    best
+                }
+            });
         }
     }
 
@@ -149,8 +159,11 @@ impl Workshop {
         let cap = 9.0 * variance;
         self.costs.clear();
         for seed in &self.seeds {
-            self.costs
-                .extend(self.points.iter().map(|p| seed.distance(*p).powi(2).min(cap)));
+            self.costs.extend(
+                self.points
+                    .iter()
+                    .map(|p| seed.distance(*p).powi(2).min(cap)),
+            );
         }
         let row = |s: usize| &self.costs[s * n..(s + 1) * n];
         let single = (0..self.seeds.len())
@@ -178,7 +191,11 @@ impl Workshop {
             .collect();
         while chosen.len() < MOST_PLANES {
             let gain = |s: usize| -> f64 {
-                row(s).iter().zip(&so_far).map(|(a, b)| (b - a).max(0.0)).sum()
+                row(s)
+                    .iter()
+                    .zip(&so_far)
+                    .map(|(a, b)| (b - a).max(0.0))
+                    .sum()
             };
             let (s, g) = (0..self.seeds.len())
                 .map(|s| (s, gain(s)))
@@ -248,7 +265,9 @@ impl Workshop {
                     }
                 }
             }
-            let Some((change, i, j, union)) = best else { break };
+            let Some((change, i, j, union)) = best else {
+                break;
+            };
             if change > DECISIVE {
                 break;
             }
@@ -267,7 +286,12 @@ impl Workshop {
     /// through all of these points.
     ///
     /// The side is that of the surface which halves the angle: unlike the nearer of the two, it does not select by noise.
-    fn split(&mut self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<([Fit; 2], Fit)> {
+    fn split(
+        &mut self,
+        one: &(u8, Fit),
+        other: &(u8, Fit),
+        variance: f64,
+    ) -> Option<([Fit; 2], Fit)> {
         let mut fits = [one.1, other.1];
         let labelled = self.points.iter().zip(&self.labels);
         self.whole.clear();
@@ -329,7 +353,11 @@ impl Workshop {
         }
         match best {
             Some((_, mut crease)) => {
-                crease.corner = if fits.len() > 2 { self.corner(fits) } else { None };
+                crease.corner = if fits.len() > 2 {
+                    self.corner(fits)
+                } else {
+                    None
+                };
                 Verdict::Creased(crease)
             }
             None if unsure => Verdict::Unsure,
@@ -339,7 +367,12 @@ impl Workshop {
 
     /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt; and by how much the
     /// criterion prefers it to one smooth surface.
-    fn crease(&mut self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<(Crease, f64)> {
+    fn crease(
+        &mut self,
+        one: &(u8, Fit),
+        other: &(u8, Fit),
+        variance: f64,
+    ) -> Option<(Crease, f64)> {
         let (fits, whole) = self.split(one, other, variance)?;
         let evidence =
             whole.criterion(variance) - fits[0].criterion(variance) - fits[1].criterion(variance);
@@ -364,7 +397,8 @@ impl Workshop {
             slope += if bent { 192.0 } else { 12.0 } / (n * length2);
         }
         let turn_sd = (variance * slope).sqrt();
-        let believable = turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        let believable =
+            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
         let crease = Crease {
             foot: e,
             tangent,
@@ -403,7 +437,9 @@ impl Workshop {
         const NEAR: f64 = 2.6;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
-                .filter(|i| self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR)
+                .filter(|i| {
+                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
+                })
                 .count();
             near >= 2
         })

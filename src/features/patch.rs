@@ -125,7 +125,10 @@ pub(super) fn fit(points: &[DVec3], variance: f64) -> Option<Fit> {
     let cap = 9.0 * variance;
     let simple = Fit {
         surface: Surface::flat(flat, plane.centre),
-        squares: points.iter().map(|p| flat.distance(*p).powi(2).min(cap)).sum(),
+        squares: points
+            .iter()
+            .map(|p| flat.distance(*p).powi(2).min(cap))
+            .sum(),
         count,
         parameters: 3,
     };
@@ -142,7 +145,10 @@ pub(super) fn fit(points: &[DVec3], variance: f64) -> Option<Fit> {
     }
     let bent = Fit {
         surface: curved,
-        squares: points.iter().map(|p| curved.distance(*p).powi(2).min(cap)).sum(),
+        squares: points
+            .iter()
+            .map(|p| curved.distance(*p).powi(2).min(cap))
+            .sum(),
         count,
         parameters: 6,
     };

@@ -165,8 +165,7 @@ impl Clusters {
         self.normals.clear();
         for (i, a) in around.clone().enumerate() {
             for b in around.clone().skip(i + 1) {
-                self.normals
-                    .extend((a - p).cross(b - p).try_normalize());
+                self.normals.extend((a - p).cross(b - p).try_normalize());
             }
         }
     }
@@ -247,7 +246,8 @@ impl Clusters {
         let n = self.sizes.len();
         let (a, b) = (self.sizes[keep] as f32, self.sizes[drop] as f32);
         for other in (0..n).filter(|o| self.sizes[*o] > 0) {
-            let d = (a * self.distances[keep * n + other] + b * self.distances[drop * n + other]) / (a + b);
+            let d = (a * self.distances[keep * n + other] + b * self.distances[drop * n + other])
+                / (a + b);
             self.distances[keep * n + other] = d;
             self.distances[other * n + keep] = d;
         }

@@ -80,7 +80,11 @@ fn add_hole(solid: &mut Solid, hole: &Hole) {
             .push(Line::Arc(centre, DVec3::Z, DVec3::X * hole.radius, TAU));
     }
     if hole.blind {
-        solid.faces.push(Face::Disc { centre: base, normal: DVec3::Z, radius: hole.radius });
+        solid.faces.push(Face::Disc {
+            centre: base,
+            normal: DVec3::Z,
+            radius: hole.radius,
+        });
     }
 }
 
@@ -234,7 +238,11 @@ pub fn cone(radius: f64, height: f64) -> Solid {
                 radii: (radius, 0.0),
                 sweep: TAU,
             },
-            Face::Disc { centre: base, normal: DVec3::Z, radius },
+            Face::Disc {
+                centre: base,
+                normal: DVec3::Z,
+                radius,
+            },
         ],
         edges: vec![Line::Arc(base, DVec3::Z, DVec3::X * radius, TAU)],
         borders: Vec::new(),
@@ -251,7 +259,11 @@ pub fn cylinder(radius: f64, height: f64) -> Solid {
         radii: (radius, radius),
         sweep: TAU,
     };
-    solid.faces.push(Face::Disc { centre: DVec3::Z * (0.5 * height), normal: DVec3::Z, radius });
+    solid.faces.push(Face::Disc {
+        centre: DVec3::Z * (0.5 * height),
+        normal: DVec3::Z,
+        radius,
+    });
     solid.edges.push(Line::Arc(
         DVec3::Z * (0.5 * height),
         DVec3::Z,
