@@ -1,6 +1,8 @@
 //! Reconstruction on bodies whose surface is known: distances, normals and times, beside what other programs reach.
 //!
-//! `cargo bench --bench reconstruction` prints the tables; `-- quick` leaves out the large clouds.
+//! `cargo bench --bench reconstruction` prints the tables. `-- quick` makes the large clouds smaller, `-- hard` runs blunt and acute edges,
+//! close sheets and slots, `-- two-million` the largest cloud, `-- only=NAME` the clouds whose name contains NAME, and
+//! `-- fandisk=FILE.obj picture=FOLDER` samples that mesh and draws it before and after.
 
 #![allow(clippy::print_stdout)]
 
@@ -9,119 +11,342 @@ mod figures;
 #[path = "../tests/surface/truth.rs"]
 mod truth;
 
-use acies::surface::Settings;
+use std::time::Instant;
+
+use acies::points::picture::{ViewDirection, render};
+use acies::points::{Frame, Neighbors, PointCloud};
+use acies::surface::{Degree, Place, Reconstruction, Scale, Settings, SmoothSurface, reconstruct};
 use figures::Trial;
+use glam::{DVec3, Vec3};
+use rayon::prelude::*;
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let quick = arguments.iter().any(|a| a == "quick");
-    let mut trials = vec![
+    let has = |word: &str| arguments.iter().any(|a| a == word);
+    let value = |key: &str| arguments.iter().find_map(|a| a.strip_prefix(key));
+    if let Some(mesh) = value("fandisk=") {
+        fandisk(mesh, value("picture="));
+        return;
+    }
+    let mut trials = if has("hard") {
+        hard_trials()
+    } else if has("two-million") {
+        vec![figures::block_trial(2_000_000)]
+    } else {
+        usual_trials(has("quick"))
+    };
+    if let Some(only) = value("only=") {
+        trials.retain(|t| t.name.contains(only));
+    }
+    println!(
+        "Distances in spacings (scan lines: in spacings across), angles in degrees; `edge` is within three of a true edge,"
+    );
+    println!(
+        "`gap` the mean distance of the true edge to the nearest output point without and with the feature lines' samples,"
+    );
+    println!(
+        "`x k20` the time as a multiple of a search for 20 neighbours of all points in the same run."
+    );
+    println!(
+        "{:<34}{:>15}{:>17}{:>15}{:>8}{:>9}{:>20}{:>8}{:>7}{:>9}",
+        "cloud",
+        "input flat/edge",
+        "output flat/edge",
+        "gap own/all",
+        "worst",
+        "projected",
+        "normals flat/edge",
+        "seconds",
+        "x k20",
+        "bytes/pt"
+    );
+    for trial in &trials {
+        row(trial);
+    }
+    if !has("hard") && !has("two-million") && value("only=").is_none() {
+        println!();
+        println!(
+            "Goals: 0.005/0.02/0.10, 0.05/0.06/0.15, 0.11/0.15/0.25, 0.032/0.04/0.20, 0.004/0.008/0.25; normals 1/2; x k20 6."
+        );
+        println!(
+            "Others on the block, flat/edge: PCL order 2 0.039/0.107, CGAL jet 0.041/0.108, CGAL bilateral 0.040/0.117, APSS 0.056/0.072;"
+        );
+        println!("their normals within three spacings of an edge: 15.1 to 17.0.");
+        weber();
+    }
+}
+
+fn usual_trials(quick: bool) -> Vec<Trial> {
+    vec![
         figures::cube_trial(52, 0.0),
         figures::cube_trial(52, 0.8),
         figures::cube_trial(52, 2.0),
         figures::block_trial(if quick { 60_000 } else { 500_000 }),
         figures::lines_trial(if quick { 1.5 } else { 0.6 }),
-    ];
-    if arguments.iter().any(|a| a == "hard") {
-        trials.clear();
-        for angle in [172.0, 165.0, 150.0, 120.0, 60.0, 40.0, 25.0] {
-            trials.push(figures::body_trial(
-                &format!("ridge {angle}"),
-                truth::ridge(angle),
-                8_000,
-                0.1,
-            ));
-        }
-        for gap in [0.3, 0.6, 1.0, 2.0] {
-            let unit = (800.0f64 / 8_000.0).sqrt();
-            trials.push(figures::body_trial(
-                &format!("plates {gap}"),
-                truth::plates(gap * unit),
-                8_000,
-                0.05,
-            ));
-        }
-        for width in [2.0, 4.0, 6.0] {
-            let unit = 0.25;
-            trials.push(figures::body_trial(
-                &format!("slot {width}"),
-                truth::slot(width * unit, width * unit),
-                8_000,
-                0.1,
-            ));
-        }
+    ]
+}
+
+fn hard_trials() -> Vec<Trial> {
+    let mut trials = vec![figures::cube_trial(30, 0.0), figures::cube_trial(24, 0.0)];
+    for angle in [172.0, 165.0, 150.0, 120.0, 60.0, 40.0, 25.0] {
+        let name = format!("ridge of {angle} degrees");
+        trials.push(figures::body_trial(&name, truth::ridge(angle), 8_000, 0.1));
+    }
+    let plate_mm = (800.0f64 / 8_000.0).sqrt();
+    for gap in [0.6, 1.0, 2.0] {
+        let name = format!("plates {gap} spacings apart");
         trials.push(figures::body_trial(
-            "block clean",
-            truth::stepped_block(),
-            60_000,
-            0.0,
-        ));
-        trials.push(figures::body_trial(
-            "block 0.3",
-            truth::stepped_block(),
-            60_000,
-            0.3,
-        ));
-        trials.push(figures::body_trial(
-            "block coarse",
-            truth::stepped_block(),
-            4_000,
-            0.1,
+            &name,
+            truth::plates(gap * plate_mm),
+            8_000,
+            0.05,
         ));
     }
-    if let Some(only) = arguments.iter().find_map(|a| a.strip_prefix("only=")) {
-        trials.retain(|t| t.name.contains(only));
+    for width in [2.0, 4.0, 6.0] {
+        let name = format!("slot {width} spacings wide");
+        let slot = truth::slot(width * 0.25, width * 0.25);
+        trials.push(figures::body_trial(&name, slot, 8_000, 0.1));
     }
-    println!(
-        "{:<34}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>8}{:>7}{:>7}{:>7}{:>8}{:>8}{:>7}{:>8}",
-        "cloud",
-        "in flat",
-        "in edge",
-        "flat",
-        "edge",
-        "gap own",
-        "gap",
-        "worst",
-        "proj",
-        "n flat",
-        "n edge",
-        "n meas",
-        "line",
-        "l worst",
-        "lines",
-        "seconds"
-    );
-    for trial in &trials {
-        row(trial);
+    for (name, count, noise) in [
+        ("block without noise", 60_000, 0.0),
+        ("block, noise 0.3", 60_000, 0.3),
+        ("block, coarse", 4_000, 0.1),
+    ] {
+        trials.push(figures::body_trial(
+            name,
+            truth::stepped_block(),
+            count,
+            noise,
+        ));
     }
+    trials
 }
 
 fn row(trial: &Trial) {
     let cloud = figures::cloud_of(&trial.seen);
-    let neighbors = acies::points::Neighbors::new(&cloud.positions);
-    let start = std::time::Instant::now();
-    let result = acies::surface::reconstruct(&cloud, &neighbors, Settings::default())
-        .expect("enough points");
+    let neighbors = Neighbors::new(&cloud.positions);
+    let search = neighbour_search(&cloud.positions, &neighbors, 20);
+    let before = peak_bytes();
+    let start = Instant::now();
+    let result = reconstruct(&cloud, &neighbors, Settings::default()).expect("enough points");
     let seconds = start.elapsed().as_secs_f64();
+    let bytes = (peak_bytes() - before) / cloud.positions.len() as f64;
+    let search = 0.5 * (search + neighbour_search(&cloud.positions, &neighbors, 20));
     let f = trial.figures(&result);
     println!(
-        "{:<34}{:>8.4}{:>8.4}{:>8.4}{:>8.4}{:>8.3}{:>8.3}{:>8.3}{:>8.4}{:>7.2}{:>7.2}{:>7.2}{:>8.4}{:>8.3}{:>7}{:>8.2}   {:?}",
+        "{:<34}{:>15}{:>17}{:>15}{:>8.3}{:>9.4}{:>20}{:>8.2}{:>7.1}{:>9.0}",
         trial.name,
-        f.input_flat,
-        f.input_edge,
-        f.flat,
-        f.edge,
-        f.edge_gap_own,
-        f.edge_gap,
+        format!("{:.4}/{:.4}", f.input_flat, f.input_edge),
+        format!("{:.4}/{:.4}", f.flat, f.edge),
+        format!("{:.3}/{:.3}", f.edge_gap_own, f.edge_gap),
         f.worst,
         f.projected,
-        f.normal_flat,
-        f.normal_edge,
-        f.normal_edge_measured,
-        f.line_rms,
-        f.line_worst,
-        f.lines,
+        format!(
+            "{:.2}/{:.2} ({:.2})",
+            f.normal_flat, f.normal_edge, f.normal_edge_measured
+        ),
         seconds,
-        result.scale
+        seconds / search,
+        bytes,
     );
+}
+
+/// Most memory this process ever held, bytes; 0 where the system does not say.
+fn peak_bytes() -> f64 {
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
+    let kib = line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<f64>().ok());
+    kib.unwrap_or(0.0) * 1024.0
+}
+
+/// Seconds for the `k` nearest neighbours of all points, the reference of all times here.
+fn neighbour_search(positions: &[DVec3], neighbors: &Neighbors, k: usize) -> f64 {
+    let start = Instant::now();
+    let far: f64 = neighbors
+        .order()
+        .par_chunks(256)
+        .map_init(Vec::new, |found, part| {
+            let mut far = 0.0f64;
+            for &i in part {
+                neighbors.nearest(positions[i as usize], k, found);
+                far = far.max(found.last().map_or(0.0, |f| f.1));
+            }
+            far
+        })
+        .reduce(|| 0.0, f64::max);
+    assert!(far > 0.0);
+    start.elapsed().as_secs_f64()
+}
+
+/// Weber's Tables 3 to 6 beside ours: feature lines against the true ones, output points against the nearest data points. His distances
+/// are divided by his spacing of 0.125.
+fn weber() {
+    println!();
+    println!(
+        "Weber 2011, in spacings of the points (his lengths divided by 0.125): largest / mean"
+    );
+    let cube = |n: usize, percent: f64| figures::cube_trial(n, percent);
+    for (table, trial, his) in [
+        (
+            "3  feature line, cube with hole",
+            cube(96, 0.0),
+            (0.0447, 0.0206),
+        ),
+        ("4  ..., noise 0.5 %", cube(96, 0.5), (0.0457, 0.0185)),
+        ("4  ..., noise 1 %", cube(96, 1.0), (0.0880, 0.0363)),
+        ("4  ..., noise 2 %", cube(96, 2.0), (0.0785, 0.0591)),
+    ] {
+        let (_, result) = trial.run(Settings::default());
+        let off = |l: &DVec3| trial.body.edge_distance(*l) / trial.unit_mm;
+        let lines: Vec<f64> = result.lines.iter().map(|l| off(&l.position)).collect();
+        print_pair(table, &lines, his);
+    }
+    for (table, trial, his) in [
+        (
+            "5  output to data, cube with hole",
+            cube(96, 0.0),
+            (0.17, 0.018),
+        ),
+        ("6  ..., noise 1 %", cube(96, 1.0), (0.43, 0.0307)),
+    ] {
+        let (_, result) = trial.run(Settings::default());
+        let data = Neighbors::new(&trial.seen.iter().map(|s| s.noisy).collect::<Vec<_>>());
+        print_pair(
+            table,
+            &to_data(&result.positions, &data, trial.unit_mm),
+            his,
+        );
+    }
+}
+
+fn to_data(output: &[DVec3], data: &Neighbors, unit_mm: f64) -> Vec<f64> {
+    let mut found = Vec::new();
+    let nearest = |p: &DVec3| {
+        data.nearest(*p, 1, &mut found);
+        found[0].1.sqrt() / unit_mm
+    };
+    output.iter().map(nearest).collect()
+}
+
+fn print_pair(table: &str, ours: &[f64], his: (f64, f64)) {
+    let worst = ours.iter().copied().fold(0.0, f64::max);
+    let mean = ours.iter().sum::<f64>() / ours.len().max(1) as f64;
+    println!(
+        "{table:<36} his {:>7.3} / {:>6.3}   ours {worst:>7.3} / {mean:>6.3}",
+        his.0 / 0.125,
+        his.1 / 0.125
+    );
+}
+
+/// Samples a triangle mesh, adds noise of a tenth of the spacing, reconstructs it, and draws input, smooth and sharp output.
+fn fandisk(mesh: &str, folder: Option<&str>) {
+    let text = std::fs::read_to_string(mesh).expect("a readable mesh");
+    let triangles = obj_triangles(&text);
+    let (positions, spacing_mm) = sample(&triangles, 41_250);
+    let data = Neighbors::new(&positions);
+    let cloud = PointCloud {
+        frame: Frame::Part,
+        positions,
+        origins: Vec::new(),
+        views: Vec::new(),
+    };
+    let result = reconstruct(&cloud, &data, Settings::default()).expect("enough points");
+    let on = |place: Place| result.lines.iter().filter(|l| l.place == place).count();
+    println!(
+        "{:?}, {} samples of edges, {} of corners",
+        result.scale,
+        on(Place::Edge),
+        on(Place::Corner)
+    );
+    print_pair(
+        "5  output to data, fandisk",
+        &to_data(&result.positions, &data, spacing_mm),
+        (0.204, 0.003),
+    );
+    let Some(folder) = folder else { return };
+    let scale = Scale::of(&cloud, &data);
+    let smooth = SmoothSurface::new(&cloud.positions, &data, Degree::Two, scale.smoothing_mm())
+        .project_all();
+    let rounded: Vec<(DVec3, Vec3)> = smooth
+        .into_iter()
+        .flatten()
+        .map(|(p, n)| (p, n.as_vec3()))
+        .collect();
+    draw(folder, "smooth", &rounded);
+    draw(folder, "sharp", &with_lines(&result));
+    let raw = acies::surface::plane_normals(&cloud.positions, &data, 20);
+    draw(
+        folder,
+        "input",
+        &cloud.positions.iter().copied().zip(raw).collect::<Vec<_>>(),
+    );
+}
+
+fn with_lines(result: &Reconstruction) -> Vec<(DVec3, Vec3)> {
+    result
+        .positions
+        .iter()
+        .copied()
+        .zip(result.normals.iter().copied())
+        .collect()
+}
+
+/// Writes a picture shaded by the angle to a lamp; both sides of a surface are lit.
+fn draw(folder: &str, name: &str, points: &[(DVec3, Vec3)]) {
+    let lamp = Vec3::new(0.4, 0.5, 0.77).normalize();
+    let fill = Vec3::new(-0.7, 0.6, -0.2).normalize();
+    let positions: Vec<DVec3> = points.iter().map(|p| p.0).collect();
+    let colours: Vec<[u8; 3]> = points
+        .iter()
+        .map(|(_, n)| {
+            let light = 0.15 + 0.6 * n.dot(lamp).abs() + 0.25 * n.dot(fill).abs();
+            [(light * 250.0) as u8; 3]
+        })
+        .collect();
+    let bytes = render(&positions, &colours, ViewDirection::Auto, (1200, 900));
+    std::fs::write(format!("{folder}/fandisk-{name}.png"), bytes).expect("a writable folder");
+}
+
+fn obj_triangles(text: &str) -> Vec<[DVec3; 3]> {
+    let mut vertices: Vec<DVec3> = Vec::new();
+    let mut triangles = Vec::new();
+    for line in text.lines() {
+        let mut words = line.split_whitespace();
+        match words.next() {
+            Some("v") => {
+                let v: Vec<f64> = words.filter_map(|w| w.parse().ok()).collect();
+                vertices.push(DVec3::new(v[0], v[1], v[2]));
+            }
+            Some("f") => {
+                let index = |w: &str| w.split('/').next().and_then(|i| i.parse::<usize>().ok());
+                let corners: Vec<DVec3> =
+                    words.filter_map(index).map(|i| vertices[i - 1]).collect();
+                triangles.push([corners[0], corners[1], corners[2]]);
+            }
+            _ => {}
+        }
+    }
+    triangles
+}
+
+/// `count` random points of the triangles by area with noise of a tenth of the spacing, and the spacing.
+fn sample(triangles: &[[DVec3; 3]], count: usize) -> (Vec<DVec3>, f64) {
+    let mut dice = truth::Dice(3);
+    let mut sums = Vec::with_capacity(triangles.len());
+    let mut area = 0.0;
+    for [a, b, c] in triangles {
+        area += 0.5 * (*b - *a).cross(*c - *a).length();
+        sums.push(area);
+    }
+    let spacing = (area / count as f64).sqrt();
+    let point = |_| {
+        let t = dice.unit() * area;
+        let [a, b, c] = triangles[sums.partition_point(|s| *s < t).min(sums.len() - 1)];
+        let (mut u, mut v) = (dice.unit(), dice.unit());
+        if u + v > 1.0 {
+            (u, v) = (1.0 - u, 1.0 - v);
+        }
+        a + (b - a) * u + (c - a) * v + dice.cloud() * (0.1 * spacing)
+    };
+    ((0..count).map(point).collect(), spacing)
 }

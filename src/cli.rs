@@ -25,7 +25,7 @@ pub enum Command {
     Demo(demo::Demo),
     /// Measure every sharp edge of a scan against its nominal.
     Inspect(inspect::Inspect),
-    /// Find the points of a scan on sharp edges, corners and boundaries.
+    /// Find the points of a scan that lie on sharp edges, corners and boundaries.
     Detect(detect::Detect),
     /// Project a scan onto its surface, keeping edges sharp.
     Reconstruct(reconstruct::Reconstruct),

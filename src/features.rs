@@ -8,12 +8,16 @@ use rayon::prelude::*;
 use crate::points::{Neighbors, PointCloud, Spacing, noise_mm, spacing};
 
 mod adaptive;
+mod boundary;
 mod flanks;
+mod lines;
 mod patch;
 pub mod profile;
 mod tangent;
+pub mod thesis;
+pub mod variation;
 
-use adaptive::{Places, Sights};
+use adaptive::{Places, Sights, THIN};
 use tangent::Tangents;
 
 /// What a point lies on. The discriminants are the values of `feature` in files.
@@ -82,8 +86,19 @@ pub fn detect(cloud: &PointCloud, neighbors: &Neighbors, method: Method) -> Dete
             .push("points: fewer than 8 distinct places, no edge can be told".to_owned());
         return detection;
     }
-    let _ = method;
-    adaptive(cloud, neighbors, &mut detection, &mut clock);
+    match method {
+        Method::Adaptive => adaptive(cloud, neighbors, &mut detection, &mut clock),
+        Method::Global => {
+            let settings = thesis::Settings::global();
+            detection.classes = thesis::detect_as_in_thesis(cloud, neighbors, &settings);
+            clock.lap("clusters");
+        }
+        Method::Variation => {
+            let settings = variation::Settings::default();
+            detection.classes = variation::detect_by_variation(cloud, neighbors, &settings);
+            clock.lap("variation");
+        }
+    }
     detection.seconds = clock.laps;
     detection
 }
@@ -94,34 +109,105 @@ fn adaptive(
     detection: &mut Detection,
     clock: &mut Clock,
 ) {
-    let places = Places {
-        positions: neighbors
-            .places()
-            .iter()
-            .map(|i| cloud.positions[*i as usize])
-            .collect(),
-        neighbors,
-        spacing_mm: detection.spacing.mean_mm,
-        noise_mm: detection.noise_mm,
-    };
-    let tangents = Tangents::new(&places.positions, neighbors);
-    clock.lap("tangent planes");
-    let sights = Sights::new(&places, &tangents);
-    clock.lap("flanks");
-    let classes: Vec<Class> = (0..places.positions.len())
-        .into_par_iter()
-        .map(|rank| match places.agree(&tangents, &sights, rank) {
-            Some(edge) if edge.is_corner() => Class::Corner,
-            Some(edge) if edge.is_edge() => Class::Edge,
-            _ => Class::None,
-        })
+    let all: Vec<DVec3> = neighbors
+        .places()
+        .iter()
+        .map(|i| cloud.positions[*i as usize])
         .collect();
-    clock.lap("agreement");
+    let classes = if detection.spacing.in_lines() {
+        in_lines(&all, neighbors, detection, clock)
+    } else {
+        evenly(all, neighbors, detection, clock)
+    };
     for (rank, class) in classes.iter().enumerate() {
         for i in neighbors.points_at(rank) {
             detection.classes[*i as usize] = *class;
         }
     }
+}
+
+/// The classes of places that lie as densely in one direction as in the other.
+fn evenly(
+    all: Vec<DVec3>,
+    neighbors: &Neighbors,
+    detection: &Detection,
+    clock: &mut Clock,
+) -> Vec<Class> {
+    let places = Places {
+        positions: all,
+        neighbors,
+        spacing_mm: detection.spacing.mean_mm,
+        noise_mm: detection.noise_mm,
+        thin_mm: THIN * detection.spacing.mean_mm,
+    };
+    let tangents = Tangents::new(&places.positions, neighbors);
+    clock.lap("tangent planes");
+    let sights = Sights::new(&places, &tangents);
+    clock.lap("flanks");
+    let edges: Vec<Class> = (0..places.positions.len())
+        .into_par_iter()
+        .map(|rank| {
+            let around = tangents.around(rank);
+            let unit = places.unit_mm(f64::from(tangents.planes[rank].reach_mm), around.len());
+            places
+                .agree(&sights, places.positions[rank], (around, unit))
+                .map_or(Class::None, |edge| edge.class())
+        })
+        .collect();
+    clock.lap("agreement");
+    let classes = boundary::mark(&places, &tangents, edges);
+    clock.lap("boundaries");
+    classes
+}
+
+/// The classes of places in scan lines: looked for on places picked out of them as densely along as across, then told to all.
+fn in_lines(
+    all: &[DVec3],
+    neighbors: &Neighbors,
+    detection: &Detection,
+    clock: &mut Clock,
+) -> Vec<Class> {
+    let across_mm = detection.spacing.across_mm;
+    let picked = lines::pick(all, neighbors, lines::PICKED * across_mm);
+    let few = Neighbors::new(&picked);
+    let positions: Vec<DVec3> = few.places().iter().map(|i| picked[*i as usize]).collect();
+    clock.lap("picking");
+    let places = Places {
+        spacing_mm: lines::picked_spacing_mm(&positions, &few),
+        positions,
+        neighbors: &few,
+        noise_mm: detection.noise_mm,
+        thin_mm: THIN * across_mm,
+    };
+    let tangents = Tangents::new(&places.positions, &few);
+    clock.lap("tangent planes");
+    let sights = Sights::new(&places, &tangents);
+    clock.lap("flanks");
+    let borders = boundary::mark(
+        &places,
+        &tangents,
+        vec![Class::None; places.positions.len()],
+    );
+    clock.lap("boundaries");
+    let classes = all
+        .par_iter()
+        .map_init(Vec::new, |found, p| {
+            few.nearest_places(*p, tangent::NEAR, found);
+            let mut around = [0; tangent::NEAR];
+            for (slot, (rank, _)) in around.iter_mut().zip(found.iter()) {
+                *slot = *rank;
+            }
+            let around = &around[..found.len()];
+            let border = around.first().map_or(Class::None, |r| borders[*r as usize]);
+            places
+                .agree(&sights, *p, (around, places.spacing_mm))
+                .map(|edge| edge.class())
+                .filter(|class| *class != Class::None)
+                .unwrap_or(border)
+        })
+        .collect();
+    clock.lap("agreement");
+    classes
 }
 
 /// A polyline along an edge, mm.

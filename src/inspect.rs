@@ -64,11 +64,12 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let mut stages = Stages::new(request.progress);
     stages.begin("spacing and noise");
     let neighbors = Neighbors::new(&cloud.positions);
+    let spacing = spacing(cloud, &neighbors);
     let scan = Scan {
         cloud,
         neighbors: &neighbors,
-        spacing: spacing(cloud, &neighbors),
-        noise_mm: noise_mm(cloud, &neighbors, &spacing(cloud, &neighbors)),
+        spacing,
+        noise_mm: noise_mm(cloud, &neighbors, &spacing),
     };
     stages.begin("alignment");
     let surface = Surface::new(nominal);
@@ -101,7 +102,7 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     };
     let measured = measure_edges(&part, &places, &surface, &settings);
     stages.begin("comparison of edges found");
-    let detection = features::detect(&part, &neighbors, Method::Adaptive);
+    let detection = features::detect(cloud, &neighbors, Method::Adaptive);
     let edges = nominal.edges();
     let compared = compare::compare(&part, &detection, nominal, (&edges, &measured));
 
@@ -206,6 +207,7 @@ fn judged(edge: &BodyEdge, measured: MeasuredEdge, recipe: &Recipe) -> EdgeResul
         length_mm: edge.length_mm,
         coverage,
         stations,
+        mean: measured.mean,
         verdict,
     }
 }

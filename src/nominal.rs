@@ -75,7 +75,7 @@ pub struct Nominal {
     pub refused: Vec<Refused>,
     /// Curves that bound no face: centre lines, sketches, construction geometry. Never measured.
     pub wires: Vec<Wire>,
-    /// Smallest and largest coordinates of faces and wires, mm.
+    /// Smallest and largest coordinates of faces, wires and loose points, mm.
     pub bounding_box_mm: [DVec3; 2],
     /// Smallest and largest coordinates of the faces alone, mm.
     pub faces_box_mm: [DVec3; 2],

@@ -23,6 +23,7 @@ use std::borrow::Cow;
 
 use glam::{DMat3, DVec3, Vec3};
 
+use crate::points::moments::Moments;
 use crate::points::{Neighbors, PointCloud};
 
 pub use baseline::{SmoothSurface, plane_normals, weighted_plane_normals};
@@ -248,7 +249,18 @@ impl<'a> Surface<'a> {
         }
     }
 
-    /// Gathers the `k` nearest supporting points of `p` into the scratch.
+    /// Gathers the places of the `k` nearest supporting points of `p` into the scratch.
+    fn gather_places(&self, p: DVec3, k: usize, scratch: &mut Scratch) {
+        self.neighbors.get().nearest(p, k, &mut scratch.found);
+        scratch.hood.clear();
+        let found = scratch.found.iter();
+        scratch
+            .hood
+            .points
+            .extend(found.map(|(index, _)| self.positions[*index as usize] - p));
+    }
+
+    /// Gathers the `k` nearest supporting points of `p` with their normals into the scratch.
     fn gather(&self, p: DVec3, k: usize, scratch: &mut Scratch) {
         self.neighbors.get().nearest(p, k, &mut scratch.found);
         scratch.hood.clear();
@@ -266,7 +278,7 @@ impl<'a> Surface<'a> {
         if !p.is_finite() {
             return None;
         }
-        self.gather(p, self.scale.points, scratch);
+        self.gather_places(p, self.scale.points, scratch);
         self.smooth_outcome(scratch).or_else(|| {
             self.gather(p, self.scale.points_wide(), scratch);
             self.sharp_outcome(scratch)
@@ -277,9 +289,11 @@ impl<'a> Surface<'a> {
     fn smooth_outcome(&self, scratch: &mut Scratch) -> Option<Outcome> {
         let hood = &scratch.hood;
         let smoothing = self.smoothing(hood.radius_mm());
-        let start = levin::weighted_normal(&hood.points, DVec3::ZERO, smoothing.h_mm)?;
+        let mut moments = Moments::default();
+        hood.points.iter().for_each(|p| moments.add(*p));
+        let start = moments.plane().normal;
         let (local, foot) = levin::project(&hood.points, DVec3::ZERO, start, &smoothing)?;
-        let limit = 1.25 * self.scale.noise_mm + self.scale.floor_mm();
+        let limit = 1.35 * self.scale.noise_mm + 3.5 * self.scale.floor_mm();
         if local.polynomial.residual_mm > limit || foot.position.length() > 3.5 * limit {
             return None;
         }

@@ -1,5 +1,10 @@
 //! Inspection against exact solids whose deviations are known: honesty of every uncertainty, reasons, alignment.
 
+#![allow(
+    clippy::print_stdout,
+    reason = "the figures are to be seen with --nocapture"
+)]
+
 #[path = "inspect/solids.rs"]
 mod solids;
 
@@ -10,6 +15,8 @@ use acies::inspect::assign::Surface;
 use acies::inspect::body::Body;
 use acies::inspect::measure::{MeasureSettings, MeasuredEdge, measure_edges};
 use acies::inspect::result::Verdict;
+use acies::inspect::{Recipe, Request, inspect};
+use acies::nominal::Nominal;
 use acies::points::{Frame, Neighbors, PointCloud};
 use glam::{DVec2, DVec3};
 use solids::{ACROSS, ALONG, Made, Noise, Solid};
@@ -63,10 +70,10 @@ impl Scores {
                     continue;
                 };
                 let expected = solid.true_d(e, &station.station);
-                for i in 0..2 {
+                for (i, sum) in truth.iter_mut().enumerate() {
                     self.z
                         .push((measured.d_mm[i] - expected[i]) / measured.u_d_mm[i]);
-                    truth[i] += expected[i];
+                    *sum += expected[i];
                 }
                 n += 1.0;
                 let nominal = acies::inspect::virtual_edge::nominal_angle(
@@ -141,7 +148,7 @@ fn make(solid: &mut Solid, noise: &mut Noise) {
 fn edges_of_a_cuboid_are_measured_honestly() {
     let mut scores = Scores::default();
     let (mut ratio, mut stations) = (0.0, 0.0);
-    for seed in 1..=6 {
+    for seed in 1..=4 {
         let mut noise = Noise(seed);
         let solid = made_cuboid(&mut noise);
         let cloud = solid.scan(&[1, 2, 3, 4, 5], SIGMA, &mut noise);
@@ -180,7 +187,7 @@ fn a_wedge_and_a_concave_edge_are_measured_honestly() {
     let angle = ANGLE_PROFILE.map(DVec2::from);
     for (name, outline) in [("wedge", &wedge[..]), ("angle profile", &angle[..])] {
         let mut scores = Scores::default();
-        for seed in 1..=4 {
+        for seed in 1..=3 {
             let mut noise = Noise(seed);
             let mut solid = Solid::prism(outline, 12.0);
             make(&mut solid, &mut noise);
@@ -276,7 +283,7 @@ fn moved(cloud: &PointCloud, machine_from_part: &RigidTransform) -> PointCloud {
 #[test]
 fn a_rough_start_is_refined_to_within_its_covariance() {
     let (mut exact, mut made) = (0.0, 0.0);
-    const SEEDS: u64 = 4;
+    const SEEDS: u64 = 3;
     for seed in 1..=SEEDS {
         for with_deviations in [false, true] {
             let mut noise = Noise(seed);
@@ -317,7 +324,7 @@ fn a_rough_start_is_refined_to_within_its_covariance() {
             }
         }
     }
-    // Mean of 4 chi-squares of 6 degrees of freedom: 6, standard deviation 1.7; 3 of them.
+    // Mean of 3 chi-squares of 6 degrees of freedom: 6, standard deviation 2; 2.5 of them.
     let n = SEEDS as f64;
     println!(
         "mean chi-square: all faces {:.2}, datums {:.2}",
@@ -331,7 +338,7 @@ fn a_rough_start_is_refined_to_within_its_covariance() {
 #[test]
 fn faces_that_depart_widen_the_covariance() {
     let mut sum = 0.0;
-    for seed in 1..=6 {
+    for seed in 1..=4 {
         let mut noise = Noise(seed);
         let mut solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
         make(&mut solid, &mut noise);
@@ -350,8 +357,8 @@ fn faces_that_depart_widen_the_covariance() {
         );
         sum += squared;
     }
-    println!("mean {:.2}", sum / 6.0);
-    assert!(sum / 6.0 < 18.0);
+    println!("mean {:.2}", sum / 4.0);
+    assert!(sum / 4.0 < 18.0);
 }
 
 #[test]
@@ -426,7 +433,8 @@ fn touches_hold_what_the_scan_does_not() {
 
 #[test]
 fn a_pose_is_found_from_nothing() {
-    for seed in 1..=3 {
+    {
+        let seed = 1;
         let mut noise = Noise(seed);
         let solid = Solid::prism(&ANGLE_PROFILE.map(DVec2::from), 12.0);
         let angle = 3.0 * noise.uniform();
@@ -473,5 +481,132 @@ fn a_symmetric_part_is_ambiguous() {
             .any(|f| f.starts_with("alignment: 4 poses fit the scan equally well")),
         "a cuboid maps onto itself by the identity and three half turns: {:?}",
         aligned.findings
+    );
+}
+
+/// Plane, cylindrical and free-form faces as read from STEP.
+#[test]
+fn a_part_read_from_step_and_sampled_as_drawn_has_no_deviation() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo/part.step");
+    let nominal = Nominal::read(&path).expect("the demo's part");
+    let mut noise = Noise(4);
+    let spacing_mm = 0.3;
+    let positions: Vec<DVec3> = Nominal::samples(&nominal, spacing_mm)
+        .into_iter()
+        .map(|s| s.point + SIGMA * noise.normal() * s.normal)
+        .collect();
+    let cloud = PointCloud::from_positions(Frame::Part, positions);
+    let surface = Surface::new(&nominal);
+    let places = surface.places(&cloud, 2.0);
+    let settings = MeasureSettings {
+        along_mm: spacing_mm,
+        across_mm: spacing_mm,
+        ..SETTINGS
+    };
+    let mut z = Vec::new();
+    for edge in measure_edges(&cloud, &places, &surface, &settings) {
+        for station in &edge.stations {
+            let measured = station.outcome.as_ref().expect("every edge is all there");
+            z.extend([0, 1].map(|i| measured.d_mm[i] / measured.u_d_mm[i]));
+        }
+    }
+    let n = z.len() as f64;
+    let rms = (z.iter().map(|z| z * z).sum::<f64>() / n).sqrt();
+    let share = z.iter().filter(|z| z.abs() < 2.0).count() as f64 / n;
+    println!("n {n}, z rms {rms:.3}, within two {share:.3}");
+    // As in Scores::assert_honest.
+    assert!((rms - 1.0).abs() < 3.0 * (0.5 / n).sqrt() + 0.03, "{rms}");
+    assert!(
+        (share - 0.9545).abs() < 3.0 * (0.0434 / n).sqrt() + 0.03,
+        "{share}"
+    );
+}
+
+#[test]
+fn an_inspection_judges_by_its_recipe() {
+    let mut noise = Noise(8);
+    let mut solid = Solid::cuboid(8.0, 6.0, 5.0);
+    // The right side is 0.2 mm too far out.
+    solid.made[3].offset = 0.2;
+    let machine_from_part = noise.motion(0.5, 20.0);
+    let scan = solid.scan(&[1, 2, 3, 4, 5], SIGMA, &mut noise);
+    let cloud = moved(&scan, &machine_from_part);
+    let recipe = Recipe::parse(
+        "rule = { guard_band = 2.0 }\ndatum_faces = [11, 12, 15, 99]\n[limits]\nd_mm = [-0.05, 0.05]\n\
+         [[edge]]\nid = \"e2\"\nname = \"front lip\"\nd1_mm = [-0.1, 0.1]\n[[edge]]\nentity = 7\n",
+    )
+    .expect("a recipe");
+    let start = noise.motion(0.05, 0.3) * machine_from_part.inverse();
+    let told = std::sync::Mutex::new(Vec::new());
+    let inspection = inspect(
+        &cloud,
+        &solid,
+        &Request {
+            progress: &|stage| told.lock().expect("one thread tells").push(stage),
+            ..Request::new(&recipe, Start::Rough(start))
+        },
+    );
+    assert_eq!(
+        inspection.alignment.status,
+        Verdict::Ok,
+        "{:?}",
+        inspection.findings
+    );
+    assert_eq!(inspection.verdict, Verdict::NotOk);
+    let stages: Vec<&str> = inspection.seconds.iter().map(|s| s.0).collect();
+    assert_eq!(*told.lock().expect("all told"), stages);
+    for (edge, nominal) in inspection.edges.iter().zip(solid.edges()) {
+        let expected = if nominal.faces.contains(&0) {
+            // The bottom was not scanned.
+            Verdict::NotDecidable
+        } else if nominal.id == "e2" {
+            Verdict::Ok
+        } else if nominal.faces.contains(&3) {
+            Verdict::NotOk
+        } else {
+            Verdict::Ok
+        };
+        assert_eq!(edge.verdict, expected, "{} of {:?}", edge.id, nominal.faces);
+    }
+    assert!(inspection.edges.iter().any(|e| e.id == "front lip"));
+    for expected in [
+        "recipe: datum_faces: #99 is no face of the nominal, expected the entity of a face; the datum is left out",
+        "recipe: edge: #7 is no sharp edge of the nominal, expected its entity or id; the entry is left out",
+    ] {
+        assert!(
+            inspection.findings.iter().any(|f| f == expected),
+            "{:?}",
+            inspection.findings
+        );
+    }
+}
+
+#[test]
+fn a_scan_of_nothing_and_a_scan_elsewhere_are_findings() {
+    let solid = Solid::cuboid(8.0, 6.0, 5.0);
+    let recipe = Recipe::default();
+    let empty = PointCloud::from_positions(Frame::Machine, Vec::new());
+    for start in [
+        Start::None,
+        Start::Auto,
+        Start::Rough(RigidTransform::IDENTITY),
+    ] {
+        let inspection = inspect(&empty, &solid, &Request::new(&recipe, start));
+        assert!(inspection.edges.iter().all(|e| e.coverage == 0.0));
+        if start == Start::Auto {
+            assert_eq!(
+                inspection.findings,
+                ["alignment: no pose of the scan fits the nominal; give a rough start"]
+            );
+        }
+    }
+    let same = PointCloud::from_positions(Frame::Machine, vec![DVec3::splat(1e4); 10_000]);
+    let start = Start::Rough(RigidTransform::IDENTITY);
+    let inspection = inspect(&same, &solid, &Request::new(&recipe, start));
+    assert_eq!(inspection.verdict, Verdict::NotDecidable);
+    assert!(
+        inspection.findings[0].starts_with("alignment: fewer than 20 points lie near the nominal"),
+        "{:?}",
+        inspection.findings
     );
 }

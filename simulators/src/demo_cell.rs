@@ -35,6 +35,8 @@ pub const MISPLACED_MM: f64 = 2.0;
 /// And turned by at most this much, rad.
 pub const MISTURNED_RAD: f64 = 1.5 * std::f64::consts::PI / 180.0;
 
+/// From a sensor to the middle of its range, mm: far enough that a camera over the middle of the line looks onto the sides at its ends.
+const STANDOFF_MM: f64 = 200.0;
 /// The stage runs this far beyond the part at both ends, mm: more than the part can be off.
 const MARGIN_MM: f64 = 5.0;
 /// The sides of the part are in the field down from here, mm.
@@ -245,13 +247,14 @@ fn misplacement(rng: &mut ChaCha8Rng) -> Pose {
 }
 
 fn optics(camera_side: f64) -> Optics {
-    let (near_mm, far_mm) = (55.0, 145.0);
+    let (near_mm, far_mm) = (STANDOFF_MM - 45.0, STANDOFF_MM + 45.0);
     Optics {
         near_mm,
         far_mm,
         width_mm: 96.0,
-        fan: Fan::Diverging(-50.0),
-        camera_mm: Optics::camera_at_angle(near_mm, far_mm, camera_side * 25_f64.to_radians()),
+        // Nearly parallel, so that faces at the rim of the field are not seen at grazing incidence.
+        fan: Fan::Diverging(-250.0),
+        camera_mm: Optics::camera_at_angle(near_mm, far_mm, camera_side * 20_f64.to_radians()),
         spot_mm: 0.06,
         blend_mm: 0.5,
         noise_mm: 0.010,
@@ -286,7 +289,8 @@ fn stand(from: DVec3) -> (Pose, u32) {
         }
     }
     let middle = 0.5 * (low + high);
-    let origin = rotation.x_axis * middle.x + z * (middle.y - 100.0) + AXIS * (low.z - MARGIN_MM);
+    let origin =
+        rotation.x_axis * middle.x + z * (middle.y - STANDOFF_MM) + AXIS * (low.z - MARGIN_MM);
     let travel = high.z - low.z + 2.0 * MARGIN_MM;
     let profiles = (travel / (MM_PER_COUNT * STEP_COUNTS as f64)).ceil() as u32;
     let translation = (origin * 1000.0).round() / 1000.0;

@@ -1,35 +1,33 @@
-//! `acies detect SCAN`: which points of a scan lie on sharp edges, corners and boundaries.
+//! `acies detect`: which points of a scan lie on sharp edges, corners and boundaries.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::time::Instant;
 
 use anyhow::anyhow;
+use clap::ValueEnum;
 
-use super::progress::Working;
 use super::{Failure, Status, print_line};
 use crate::features::{Class, Detection, Method, detect};
-use crate::points::picture::{self, ViewDirection};
+use crate::points::picture::{self, ViewDirection, render};
 use crate::points::write::write_atomically;
-use crate::points::{self, Column, Neighbors, PointsError, Unit, write_ply};
+use crate::points::{Column, Encoding, Neighbors, PointCloud, PointsError, Unit, read, write_ply};
 
-/// Size of a picture, pixels.
-const PICTURE_PX: (u32, u32) = (1600, 1200);
-
-/// Finds the points that lie on a sharp edge, on a corner or on the boundary of the data.
+/// Find the points of a scan that lie on sharp edges, corners and boundaries.
 ///
-/// Needs nothing but coordinates; scale, noise and thresholds are estimated from the scan. Where the scan says which profile and
-/// column a point comes from, that is used.
+/// Spacing and noise are measured from the points, and every threshold follows from them: there is nothing to set. What is found is thin:
+/// points within about one spacing of the edge.
 #[derive(Debug, clap::Args)]
 pub struct Detect {
-    /// The scan: PLY, PCD, STL, OBJ or text with columns x y z.
+    /// PLY, PCD, XYZ or CSV text, STL or OBJ.
     scan: PathBuf,
-    /// Write the points, in the order of the scan, with their class (.ply: `x y z` double, `feature` uchar: 0 none, 1 edge,
-    /// 2 corner, 3 boundary), or a picture of them (.png). May be given several times.
-    #[arg(short, long, value_name = "OUT")]
-    output: Vec<PathBuf>,
-    /// adaptive is the one to use; the other two are those of the literature, for comparison.
-    #[arg(long, default_value = "adaptive")]
+    /// Where to write the result: PLY with x y z (double) and feature (uchar: 0 none, 1 edge, 2 corner, 3 boundary), or a PNG picture.
+    #[arg(short = 'o', long = "output", value_name = "OUT.ply|.png")]
+    output: Option<PathBuf>,
+    /// How edges are looked for.
+    #[arg(long, value_enum, default_value = "adaptive")]
     method: MethodName,
-    /// Unit of the scan: um, mm, cm, m or in. PLY, PCD and STL do not say.
+    /// Unit of the scan's coordinates: um, mm, cm, m or inch.
     #[arg(long, default_value = "mm")]
     unit: Unit,
     /// Print one JSON object on standard output.
@@ -37,57 +35,30 @@ pub struct Detect {
     json: bool,
 }
 
-#[derive(Debug, Clone, Copy, clap::ValueEnum)]
+/// The methods by their names on the command line.
+#[derive(Debug, Clone, Copy, ValueEnum)]
 enum MethodName {
-    /// Surfaces fitted on both sides; every threshold follows from the data.
+    /// Surfaces fitted on both sides; for all data.
     Adaptive,
-    /// Gauss-map clustering with one sensitivity for all points (Weber 2011).
+    /// Gauss-map clustering with one sensitivity (Weber 2011), for comparison.
     Global,
-    /// Multi-scale surface variation (Pauly et al. 2003).
+    /// Multi-scale surface variation (Pauly et al. 2003), for comparison.
     Variation,
 }
 
-impl From<MethodName> for Method {
-    fn from(name: MethodName) -> Self {
-        match name {
-            MethodName::Adaptive => Method::Adaptive,
-            MethodName::Global => Method::Global,
-            MethodName::Variation => Method::Variation,
-        }
-    }
-}
-
-impl Detect {
-    /// Carries the command out.
-    ///
-    /// # Errors
-    /// Bad input where the scan cannot be understood; input or output where a file cannot be read or written.
-    pub fn run(self) -> Result<Status, Failure> {
-        for path in &self.output {
-            form_of(path)?;
-        }
-        let read = points::read(&self.scan, self.unit).map_err(|error| match error {
-            PointsError::Read { .. } => Failure::Io(error.into()),
-            _ => Failure::BadInput(error.into()),
-        })?;
-        let working = Working::begin("looking for edges");
-        let neighbors = Neighbors::new(&read.cloud.positions);
-        let detection = detect(&read.cloud, &neighbors, self.method.into());
-        working.end();
-        for path in &self.output {
-            write(path, &read.cloud.positions, &detection.classes)?;
-        }
-        let findings: Vec<&String> = read.findings.iter().chain(&detection.findings).collect();
-        if self.json {
-            print_line(&as_json(&detection, &findings).to_string())?;
-        } else {
-            print_line(&in_words(&detection))?;
-            for finding in findings {
-                print_line(&format!("finding: {finding}"))?;
-            }
-        }
-        Ok(Status::Done)
-    }
+/// What the command says about its work.
+#[derive(Debug, serde::Serialize)]
+struct Summary<'a> {
+    points: usize,
+    edges: usize,
+    corners: usize,
+    boundaries: usize,
+    spacing_mm: f64,
+    spacing_along_mm: f64,
+    spacing_across_mm: f64,
+    noise_mm: f64,
+    findings: &'a [String],
+    seconds: BTreeMap<&'a str, f64>,
 }
 
 enum Form {
@@ -95,79 +66,116 @@ enum Form {
     Png,
 }
 
+impl Detect {
+    /// Carries the command out.
+    ///
+    /// # Errors
+    /// [`Failure::BadInput`] for a scan that cannot be read, [`Failure::Usage`] for an output whose ending names no form, [`Failure::Io`]
+    /// where the result cannot be written.
+    pub fn run(self) -> Result<Status, Failure> {
+        let form = self.output.as_deref().map(form_of).transpose()?;
+        let start = Instant::now();
+        let scan = read(&self.scan, self.unit).map_err(reading)?;
+        let read_seconds = start.elapsed().as_secs_f64();
+        let start = Instant::now();
+        let neighbors = Neighbors::new(&scan.cloud.positions);
+        let neighbour_seconds = start.elapsed().as_secs_f64();
+        let method = match self.method {
+            MethodName::Adaptive => Method::Adaptive,
+            MethodName::Global => Method::Global,
+            MethodName::Variation => Method::Variation,
+        };
+        let mut detection = detect(&scan.cloud, &neighbors, method);
+        detection.findings.splice(0..0, scan.findings);
+        detection
+            .seconds
+            .extend([("read", read_seconds), ("neighbours", neighbour_seconds)]);
+        if let (Some(path), Some(form)) = (&self.output, form) {
+            write(path, &form, &scan.cloud, &detection)?;
+        }
+        self.say(&detection)?;
+        Ok(Status::Done)
+    }
+
+    fn say(&self, detection: &Detection) -> Result<(), Failure> {
+        let summary = Summary {
+            points: detection.classes.len(),
+            edges: detection.count(Class::Edge),
+            corners: detection.count(Class::Corner),
+            boundaries: detection.count(Class::Boundary),
+            spacing_mm: detection.spacing.mean_mm,
+            spacing_along_mm: detection.spacing.along_mm,
+            spacing_across_mm: detection.spacing.across_mm,
+            noise_mm: detection.noise_mm,
+            findings: &detection.findings,
+            seconds: detection.seconds.iter().copied().collect(),
+        };
+        if self.json {
+            let text = serde_json::to_string(&summary).map_err(|e| Failure::Internal(e.into()))?;
+            return print_line(&text);
+        }
+        print_line(&format!(
+            "{} points: {} on edges, {} on corners, {} on boundaries; spacing {:.4} mm, noise {:.4} mm",
+            summary.points,
+            summary.edges,
+            summary.corners,
+            summary.boundaries,
+            summary.spacing_mm,
+            summary.noise_mm,
+        ))?;
+        for finding in summary.findings {
+            print_line(&format!("note: {finding}"))?;
+        }
+        Ok(())
+    }
+}
+
 fn form_of(path: &Path) -> Result<Form, Failure> {
-    match path.extension().and_then(|extension| extension.to_str()) {
-        Some("ply") => Ok(Form::Ply),
-        Some("png") => Ok(Form::Png),
+    let ending = path.extension().unwrap_or_default().to_string_lossy();
+    match ending.to_ascii_lowercase().as_str() {
+        "ply" => Ok(Form::Ply),
+        "png" => Ok(Form::Png),
         _ => Err(Failure::Usage(anyhow!(
-            "{}: the ending says in which form to write, expected .ply or .png",
+            "{}: its ending is `{ending}`, expected ply or png; name the output so",
             path.display()
         ))),
     }
 }
 
-fn write(path: &Path, positions: &[glam::DVec3], classes: &[Class]) -> Result<(), Failure> {
-    let written = match form_of(path)? {
-        Form::Ply => {
-            let features: Vec<u8> = classes.iter().map(|&class| class as u8).collect();
-            write_ply(
-                path,
-                positions,
-                &[Column::U8("feature", &features)],
-                points::Encoding::LittleEndian,
-            )
-        }
-        Form::Png => {
-            let colours: Vec<[u8; 3]> = classes.iter().map(|&class| colour(class)).collect();
-            let png = picture::render(positions, &colours, ViewDirection::Auto, PICTURE_PX);
-            write_atomically(path, &png)
-        }
-    };
-    written.map_err(|error| Failure::Io(error.into()))
+fn reading(error: PointsError) -> Failure {
+    match error {
+        PointsError::Read { .. } | PointsError::Write { .. } => Failure::Io(error.into()),
+        _ => Failure::BadInput(error.into()),
+    }
 }
 
-fn colour(class: Class) -> [u8; 3] {
+fn write(
+    path: &Path,
+    form: &Form,
+    cloud: &PointCloud,
+    detection: &Detection,
+) -> Result<(), Failure> {
+    let written = match form {
+        Form::Ply => {
+            let features: Vec<u8> = detection.classes.iter().map(|c| *c as u8).collect();
+            let columns = [Column::U8("feature", &features)];
+            write_ply(path, &cloud.positions, &columns, Encoding::LittleEndian)
+        }
+        Form::Png => {
+            const SIZE_PX: (u32, u32) = (1600, 1200);
+            let colours: Vec<[u8; 3]> = detection.classes.iter().map(colour).collect();
+            let picture = render(&cloud.positions, &colours, ViewDirection::Auto, SIZE_PX);
+            write_atomically(path, &picture)
+        }
+    };
+    written.map_err(|e| Failure::Io(e.into()))
+}
+
+fn colour(class: &Class) -> [u8; 3] {
     match class {
         Class::None => picture::NONE,
         Class::Edge => picture::EDGE,
         Class::Corner => picture::CORNER,
         Class::Boundary => picture::BOUNDARY,
     }
-}
-
-fn as_json(detection: &Detection, findings: &[&String]) -> serde_json::Value {
-    let seconds: serde_json::Map<String, serde_json::Value> = detection
-        .seconds
-        .iter()
-        .map(|(stage, seconds)| ((*stage).to_owned(), (*seconds).into()))
-        .collect();
-    serde_json::json!({
-        "points": detection.classes.len(),
-        "edges": detection.count(Class::Edge),
-        "corners": detection.count(Class::Corner),
-        "boundaries": detection.count(Class::Boundary),
-        "spacing_mm": detection.spacing.mean_mm,
-        "spacing_along_mm": detection.spacing.along_mm,
-        "spacing_across_mm": detection.spacing.across_mm,
-        "noise_mm": detection.noise_mm,
-        "findings": findings,
-        "seconds": seconds,
-    })
-}
-
-fn in_words(detection: &Detection) -> String {
-    format!(
-        "{} points: {} on edges, {} on corners, {} on boundaries; spacing {:.4} mm, noise {:.4} mm, {:.2} s",
-        detection.classes.len(),
-        detection.count(Class::Edge),
-        detection.count(Class::Corner),
-        detection.count(Class::Boundary),
-        detection.spacing.mean_mm,
-        detection.noise_mm,
-        detection
-            .seconds
-            .iter()
-            .map(|(_, seconds)| seconds)
-            .sum::<f64>()
-    )
 }

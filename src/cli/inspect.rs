@@ -74,7 +74,7 @@ impl Inspect {
         })?;
         let mut inspection = self.inspect(&scan, &nominal, &recipe);
         inspection.findings.extend(scan.findings.iter().cloned());
-        let facts = self.facts(&scan, &nominal, recipe, &inspection);
+        let facts = self.facts(&scan, recipe, &inspection);
         let report = Report::new(&inspection, &facts);
         for path in &self.output {
             report.write_atomically(path).map_err(|error| match error {
@@ -133,17 +133,11 @@ impl Inspect {
         inspection
     }
 
-    fn facts(
-        &self,
-        scan: &Read,
-        nominal: &Nominal,
-        recipe: Recipe,
-        inspection: &Inspection,
-    ) -> Facts {
+    fn facts(&self, scan: &Read, recipe: Recipe, inspection: &Inspection) -> Facts {
         let estimate = inspection.scan.as_ref();
         let lines = estimate.filter(|e| e.spacing.in_lines());
         Facts {
-            part: nominal.name.clone(),
+            part: part_name(&self.nominal),
             nominal: file_name(&self.nominal),
             // The file's time is as near as a file can say when it was scanned.
             created: std::fs::metadata(&self.scan)
@@ -161,6 +155,14 @@ impl Inspect {
             recipe,
         }
     }
+}
+
+/// What people call the part: the model's file without its ending.
+fn part_name(path: &Path) -> String {
+    path.file_stem()
+        .unwrap_or(path.as_os_str())
+        .to_string_lossy()
+        .into_owned()
 }
 
 fn file_name(path: &Path) -> String {

@@ -6,6 +6,7 @@
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::Class;
 use super::flanks::{Crease, FAR, Verdict, Workshop, overlooked_turn};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
@@ -16,7 +17,7 @@ const LEVELS: [usize; 3] = [40, 100, 220];
 /// Flanks are allowed to depart from a quadric by this many spacings beside the noise.
 const MODEL_ERROR: f64 = 0.025;
 /// A point is marked when the edge passes within this many spacings.
-const THIN: f64 = 0.9;
+pub(super) const THIN: f64 = 0.9;
 /// Share of the neighbours that must see an edge for it to be believed.
 const AGREEMENT: f64 = 0.45;
 
@@ -30,6 +31,8 @@ pub(super) struct Places<'a> {
     pub spacing_mm: f64,
     /// Noise, mm.
     pub noise_mm: f64,
+    /// A point is marked when the edge passes nearer than this, mm; for places of the cloud's spacing.
+    pub thin_mm: f64,
 }
 
 /// The edge near a place, relative to it, mm.
@@ -48,19 +51,22 @@ pub(super) struct Agreed {
     /// From the place to the edge, mm.
     pub foot: DVec3,
     pub tangent: DVec3,
-    /// In units of the spacing at the place.
+    /// From the place to the edge, as a share of the distance at which it is marked.
     pub distance: f64,
-    /// From the place to the corner, spacings.
+    /// The same for the corner.
     pub corner_distance: Option<f64>,
 }
 
 impl Agreed {
-    pub fn is_edge(&self) -> bool {
-        self.distance < THIN
-    }
-
-    pub fn is_corner(&self) -> bool {
-        self.corner_distance.is_some_and(|d| d < THIN)
+    /// The class of the place.
+    pub fn class(&self) -> Class {
+        if self.distance >= 1.0 {
+            Class::None
+        } else if self.corner_distance.is_some_and(|d| d < 1.0) {
+            Class::Corner
+        } else {
+            Class::Edge
+        }
     }
 }
 
@@ -148,7 +154,11 @@ impl Places<'_> {
         let apart = APART * reach / 3.57;
         for (_, i) in &shop.ranked {
             let at = shop.flanks.points[*i as usize];
-            if shop.taken.iter().all(|t: &DVec3| t.distance_squared(at) > apart * apart) {
+            if shop
+                .taken
+                .iter()
+                .all(|t: &DVec3| t.distance_squared(at) > apart * apart)
+            {
                 shop.taken.push(at);
                 let plane = &tangents.planes[shop.found[*i as usize].0 as usize];
                 let normal = plane.normal();
@@ -163,11 +173,13 @@ impl Places<'_> {
         }
     }
 
-    /// The edge near `rank` that its neighbours agree upon.
-    pub fn agree(&self, tangents: &Tangents, sights: &Sights, rank: usize) -> Option<Agreed> {
-        let p = self.positions[rank];
-        let around = tangents.around(rank);
-        let unit = self.unit_mm(f64::from(tangents.planes[rank].reach_mm), around.len());
+    /// The edge near `p` that the places `around` it agree upon; `unit` is the spacing there, mm.
+    pub fn agree(
+        &self,
+        sights: &Sights,
+        p: DVec3,
+        (around, unit): (&[u32], f64),
+    ) -> Option<Agreed> {
         let mut witnesses = [Witness::default(); super::tangent::NEAR];
         let mut seeing = 0;
         for (witness, j) in witnesses.iter_mut().zip(around) {
@@ -179,11 +191,12 @@ impl Places<'_> {
         if seeing < 3 {
             return None;
         }
+        let thin = self.thin_mm * (unit / self.spacing_mm);
         let witnesses = &witnesses[..around.len()];
         let mut best: Option<Agreed> = None;
         for (foot, sight) in witnesses.iter().filter_map(|w| w.sight).take(8) {
             let (share, at) = fit_feet(witnesses, (foot, sight.tangent), unit);
-            let distance = at.length();
+            let distance = at.length() * unit / thin;
             if share >= AGREEMENT && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
                     foot: at * unit,
@@ -194,7 +207,9 @@ impl Places<'_> {
             }
         }
         let mut agreed = best?;
-        agreed.corner_distance = self.corner(around, sights, (p, unit));
+        agreed.corner_distance = self
+            .corner(around, sights, (p, unit))
+            .map(|d| d * unit / thin);
         Some(agreed)
     }
 
@@ -204,9 +219,11 @@ impl Places<'_> {
             Some((self.positions[*j as usize] + c - p) / unit)
         });
         let (mut sum, mut n) = (DVec3::ZERO, 0);
-        let nearest = corners
-            .clone()
-            .fold(DVec3::INFINITY, |a, b| if b.length() < a.length() { b } else { a });
+        let nearest =
+            corners.clone().fold(
+                DVec3::INFINITY,
+                |a, b| if b.length() < a.length() { b } else { a },
+            );
         for c in corners.filter(|c| c.distance_squared(nearest) < 1.5) {
             sum += c;
             n += 1;
@@ -254,7 +271,11 @@ fn fit_feet(witnesses: &[Witness], (foot, tangent): (DVec3, DVec3), unit: f64) -
             }
         }
     }
-    let share = if votes < 3 { 0.0 } else { f64::from(votes) / f64::from(expected) };
+    let share = if votes < 3 {
+        0.0
+    } else {
+        f64::from(votes) / f64::from(expected)
+    };
     // Bending is held back a little, so that few feet give a straight line.
     a[1][1] += 0.02 * a[0][0];
     a[2][2] += 0.1 * a[0][0];

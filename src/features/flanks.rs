@@ -63,6 +63,8 @@ pub(super) struct Workshop {
     costs: Vec<f64>,
     labels: Vec<u8>,
     near: Vec<(f64, u32)>,
+    parts: [Vec<DVec3>; 2],
+    whole: Vec<DVec3>,
 }
 
 impl Workshop {
@@ -100,7 +102,7 @@ impl Workshop {
 
     /// The verdict where one smooth surface explains all points so well that no crease could be decisive.
     fn at_a_glance(&self, variance: f64) -> Option<Verdict> {
-        let whole = fit(&self.points, variance, |_| true)?;
+        let whole = fit(&self.points, variance)?;
         let n = self.points.len();
         let expected = (n - whole.parameters.min(n)) as f64;
         if whole.squares > variance * (expected + 0.5 * DECISIVE) {
@@ -109,7 +111,11 @@ impl Workshop {
         let reach = self.points[n - 1].length();
         let turn = 2.0 * whole.surface.curvature() * reach;
         let smooth = turn < 0.7 * LEAST_TURN || turn > 1.5 * overlooked_turn(variance, n, reach);
-        Some(if smooth { Verdict::Smooth } else { Verdict::Unsure })
+        Some(if smooth {
+            Verdict::Smooth
+        } else {
+            Verdict::Unsure
+        })
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -137,7 +143,13 @@ impl Workshop {
             self.seeds.push(Plane::through(
                 self.near[..k].iter().map(|(_, i)| points[*i as usize]),
             ));
-            at = (0..n).fold(0, |best, i| if self.costs[i] > self.costs[best] { i } else { best });
+            at = (0..n).fold(0, |best, i| {
+                if self.costs[i] > self.costs[best] {
+                    i
+                } else {
+                    best
+                }
+            });
         }
     }
 
@@ -147,8 +159,11 @@ impl Workshop {
         let cap = 9.0 * variance;
         self.costs.clear();
         for seed in &self.seeds {
-            self.costs
-                .extend(self.points.iter().map(|p| seed.distance(*p).powi(2).min(cap)));
+            self.costs.extend(
+                self.points
+                    .iter()
+                    .map(|p| seed.distance(*p).powi(2).min(cap)),
+            );
         }
         let row = |s: usize| &self.costs[s * n..(s + 1) * n];
         let single = (0..self.seeds.len())
@@ -176,7 +191,11 @@ impl Workshop {
             .collect();
         while chosen.len() < MOST_PLANES {
             let gain = |s: usize| -> f64 {
-                row(s).iter().zip(&so_far).map(|(a, b)| (b - a).max(0.0)).sum()
+                row(s)
+                    .iter()
+                    .zip(&so_far)
+                    .map(|(a, b)| (b - a).max(0.0))
+                    .sum()
             };
             let (s, g) = (0..self.seeds.len())
                 .map(|s| (s, gain(s)))
@@ -222,8 +241,12 @@ impl Workshop {
         let mut doubt = f64::INFINITY;
         let mut fits: Vec<(u8, Fit)> = (0..count)
             .filter_map(|s| {
-                let members = self.labels.iter().filter(|l| **l == s).count();
-                (members >= 4).then(|| fit(&self.points, variance, |i| self.labels[i] == s))?
+                let labelled = self.points.iter().zip(&self.labels);
+                self.whole.clear();
+                self.whole
+                    .extend(labelled.filter(|(_, l)| **l == s).map(|(p, _)| *p));
+                (self.whole.len() >= 4)
+                    .then(|| fit(&self.whole, variance))?
                     .map(|f| (s, f))
             })
             .collect();
@@ -242,7 +265,9 @@ impl Workshop {
                     }
                 }
             }
-            let Some((change, i, j, union)) = best else { break };
+            let Some((change, i, j, union)) = best else {
+                break;
+            };
             if change > DECISIVE {
                 break;
             }
@@ -261,23 +286,37 @@ impl Workshop {
     /// through all of these points.
     ///
     /// The side is that of the surface which halves the angle: unlike the nearer of the two, it does not select by noise.
-    fn split(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<([Fit; 2], Fit)> {
-        let mut parts = [one.1, other.1];
-        let either = |i: usize| self.labels[i] == one.0 || self.labels[i] == other.0;
+    fn split(
+        &mut self,
+        one: &(u8, Fit),
+        other: &(u8, Fit),
+        variance: f64,
+    ) -> Option<([Fit; 2], Fit)> {
+        let mut fits = [one.1, other.1];
+        let labelled = self.points.iter().zip(&self.labels);
+        self.whole.clear();
+        self.whole.extend(
+            labelled
+                .filter(|(_, l)| **l == one.0 || **l == other.0)
+                .map(|(p, _)| *p),
+        );
         for _ in 0..2 {
-            let [a, b] = [parts[0].surface, parts[1].surface];
+            let [a, b] = [fits[0].surface, fits[1].surface];
             let facing = self.facing([one.0, other.0], &[a, b]);
-            let second = |i: usize| {
-                let p = self.points[i];
-                facing[0] * b.distance(p) < facing[1] * a.distance(p)
-            };
-            parts = [
-                fit(&self.points, variance, |i| either(i) && !second(i))?,
-                fit(&self.points, variance, |i| either(i) && second(i))?,
-            ];
+            let [first, second] = &mut self.parts;
+            first.clear();
+            second.clear();
+            for p in &self.whole {
+                if facing[0] * b.distance(*p) < facing[1] * a.distance(*p) {
+                    second.push(*p);
+                } else {
+                    first.push(*p);
+                }
+            }
+            fits = [fit(first, variance)?, fit(second, variance)?];
         }
-        let whole = fit(&self.points, variance, either)?;
-        Some((parts, whole))
+        let whole = fit(&self.whole, variance)?;
+        Some((fits, whole))
     }
 
     /// On which side of the other surface each one's points lie: their signs.
@@ -294,7 +333,7 @@ impl Workshop {
     }
 
     /// The nearest decisive crease between two of the surfaces.
-    fn nearest_crease(&self, fits: &[(u8, Fit)], (variance, most_turn): (f64, f64)) -> Verdict {
+    fn nearest_crease(&mut self, fits: &[(u8, Fit)], (variance, most_turn): (f64, f64)) -> Verdict {
         let mut best: Option<(f64, Crease)> = None;
         let mut unsure = false;
         for i in 0..fits.len() {
@@ -314,7 +353,11 @@ impl Workshop {
         }
         match best {
             Some((_, mut crease)) => {
-                crease.corner = if fits.len() > 2 { self.corner(fits) } else { None };
+                crease.corner = if fits.len() > 2 {
+                    self.corner(fits)
+                } else {
+                    None
+                };
                 Verdict::Creased(crease)
             }
             None if unsure => Verdict::Unsure,
@@ -324,7 +367,12 @@ impl Workshop {
 
     /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt; and by how much the
     /// criterion prefers it to one smooth surface.
-    fn crease(&self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<(Crease, f64)> {
+    fn crease(
+        &mut self,
+        one: &(u8, Fit),
+        other: &(u8, Fit),
+        variance: f64,
+    ) -> Option<(Crease, f64)> {
         let (fits, whole) = self.split(one, other, variance)?;
         let evidence =
             whole.criterion(variance) - fits[0].criterion(variance) - fits[1].criterion(variance);
@@ -349,7 +397,8 @@ impl Workshop {
             slope += if bent { 192.0 } else { 12.0 } / (n * length2);
         }
         let turn_sd = (variance * slope).sqrt();
-        let believable = turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
+        let believable =
+            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
         let crease = Crease {
             foot: e,
             tangent,
@@ -388,7 +437,9 @@ impl Workshop {
         const NEAR: f64 = 2.6;
         labels.iter().all(|label| {
             let near = (0..self.points.len())
-                .filter(|i| self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR)
+                .filter(|i| {
+                    self.labels[*i] == *label && self.points[*i].distance_squared(e) < NEAR * NEAR
+                })
                 .count();
             near >= 2
         })

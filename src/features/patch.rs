@@ -92,7 +92,11 @@ impl Surface {
 
     /// Largest curvature at the middle of the fit, for a frame nearly tangent.
     pub fn curvature(&self) -> f64 {
-        let [xx, xy, yy] = [2.0 * self.coefficients[3], self.coefficients[4], 2.0 * self.coefficients[5]];
+        let [xx, xy, yy] = [
+            2.0 * self.coefficients[3],
+            self.coefficients[4],
+            2.0 * self.coefficients[5],
+        ];
         let mean = 0.5 * (xx + yy);
         mean.abs() + (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
     }
@@ -103,38 +107,28 @@ impl Surface {
     }
 }
 
-/// The better, by Bayes' criterion, of the plane and the quadric through those `points` that `member` admits.
+/// The better, by Bayes' criterion, of the plane and the quadric through `points`.
 ///
 /// `variance` is that of the noise; residuals count up to three standard deviations. `None` for fewer than three points.
-pub(super) fn fit(points: &[DVec3], variance: f64, member: impl Fn(usize) -> bool) -> Option<Fit> {
-    let mut moments = Moments::default();
-    for (_, p) in points.iter().enumerate().filter(|(i, _)| member(*i)) {
-        moments.add(*p);
-    }
-    let count = moments.count() as usize;
+pub(super) fn fit(points: &[DVec3], variance: f64) -> Option<Fit> {
+    let count = points.len();
     if count < 3 {
         return None;
     }
+    let mut moments = Moments::default();
+    points.iter().for_each(|p| moments.add(*p));
     let plane = moments.plane();
-    let flat = Surface::flat(
-        Plane {
-            normal: plane.normal,
-            offset: plane.normal.dot(plane.centre),
-        },
-        plane.centre,
-    );
-    let cap = 9.0 * variance;
-    let squares = |surface: &Surface| -> f64 {
-        points
-            .iter()
-            .enumerate()
-            .filter(|(i, _)| member(*i))
-            .map(|(_, p)| surface.distance(*p).powi(2).min(cap))
-            .sum()
+    let flat = Plane {
+        normal: plane.normal,
+        offset: plane.normal.dot(plane.centre),
     };
+    let cap = 9.0 * variance;
     let simple = Fit {
-        surface: flat,
-        squares: squares(&flat),
+        surface: Surface::flat(flat, plane.centre),
+        squares: points
+            .iter()
+            .map(|p| flat.distance(*p).powi(2).min(cap))
+            .sum(),
         count,
         parameters: 3,
     };
@@ -142,16 +136,19 @@ pub(super) fn fit(points: &[DVec3], variance: f64, member: impl Fn(usize) -> boo
     if count < 9 || !worth_bending {
         return Some(simple);
     }
-    let mut curved = flat;
+    let mut curved = simple.surface;
     for _ in 0..2 {
-        let Some(better) = bend(&curved, points, &member) else {
+        let Some(better) = bend(&curved, points) else {
             return Some(simple);
         };
         curved = better;
     }
     let bent = Fit {
         surface: curved,
-        squares: squares(&curved),
+        squares: points
+            .iter()
+            .map(|p| curved.distance(*p).powi(2).min(cap))
+            .sum(),
         count,
         parameters: 6,
     };
@@ -163,13 +160,16 @@ pub(super) fn fit(points: &[DVec3], variance: f64, member: impl Fn(usize) -> boo
 }
 
 /// Least squares of the six coefficients in the frame of `start`, each height weighted by the slope of `start` there.
-fn bend(start: &Surface, points: &[DVec3], member: &impl Fn(usize) -> bool) -> Option<Surface> {
+fn bend(start: &Surface, points: &[DVec3]) -> Option<Surface> {
     let mut a = [[0.0; 6]; 6];
     let mut b = [0.0; 6];
-    for (_, p) in points.iter().enumerate().filter(|(i, _)| member(*i)) {
+    let c = &start.coefficients;
+    for p in points {
         let [x, y, z] = start.local(*p);
         let row = [1.0, x, y, x * x, x * y, y * y];
-        let weight = 1.0 / start.height(*p).1.length_squared();
+        let hx = c[1] + 2.0 * c[3] * x + c[4] * y;
+        let hy = c[2] + c[4] * x + 2.0 * c[5] * y;
+        let weight = 1.0 / (1.0 + hx * hx + hy * hy);
         for i in 0..6 {
             let w = weight * row[i];
             b[i] += w * z;

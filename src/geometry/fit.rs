@@ -89,13 +89,7 @@ impl<const P: usize> NormalSums<P> {
 
     /// The full symmetric normal matrix.
     pub fn matrix(&self) -> [[f64; P]; P] {
-        let mut full = self.matrix;
-        for i in 0..P {
-            for j in i + 1..P {
-                full[i][j] = self.matrix[j][i];
-            }
-        }
-        full
+        std::array::from_fn(|i| std::array::from_fn(|j| self.matrix[i.max(j)][i.min(j)]))
     }
 
     /// Coefficients and cofactor matrix, or `None` where the observations do not determine them.

@@ -85,6 +85,9 @@ const MAX_HALVINGS: usize = 12;
 /// A step shorter than this share of the coordinates is rounding.
 const ROUNDING: f64 = 1e-14;
 
+/// After a Newton step shorter than this share of the coordinates, what is left is its square: rounding.
+const LAST_STEP: f64 = 1e-8;
+
 /// The parameter of a local nearest point of a curve, reached downhill from `start`, and its squared distance.
 pub fn nearest_on_curve(
     curve: impl Fn(f64) -> [DVec3; 3],
@@ -110,12 +113,21 @@ pub fn nearest_on_curve(
         {
             break;
         }
+        if step * step * speed2 <= (resolution * (LAST_STEP / ROUNDING)).powi(2) {
+            let next = range.bring(t + step);
+            let last = curve(next)[0].distance_squared(p);
+            if level(last, d2) {
+                (t, d2) = (next, last.min(d2));
+            }
+            break;
+        }
         let mut moved = false;
         for _ in 0..MAX_HALVINGS {
             let next = range.bring(t + step);
             let candidate = curve(next);
             let next_d2 = candidate[0].distance_squared(p);
-            if next_d2 < d2 {
+            let slope = |c: &[DVec3; 3]| c[1].dot(c[0] - p).abs();
+            if next_d2 < d2 || (level(next_d2, d2) && slope(&candidate) < 0.5 * slope(&at)) {
                 (t, at, d2, moved) = (next, candidate, next_d2, true);
                 break;
             }
@@ -139,31 +151,86 @@ pub fn nearest_on_surface(
     let mut at = surface(uv.0, uv.1);
     let mut d2 = at.point.distance_squared(p);
     for _ in 0..MAX_STEPS {
-        let mut step = newton_step(&at, p, uv, ranges);
+        let step = newton_step(&at, p, uv, ranges);
         let resolution = ROUNDING * (at.point.length() + p.length());
         let length = at.du.length() * step.x.abs() + at.dv.length() * step.y.abs();
         if !step.is_finite() || length <= resolution {
             break;
         }
-        let mut moved = false;
-        for _ in 0..MAX_HALVINGS {
+        if length <= resolution * (LAST_STEP / ROUNDING) {
             let next = (
                 ranges[0].bring(uv.0 + step.x),
                 ranges[1].bring(uv.1 + step.y),
             );
-            let candidate = surface(next.0, next.1);
-            let next_d2 = candidate.point.distance_squared(p);
-            if next_d2 < d2 {
-                (uv, at, d2, moved) = (next, candidate, next_d2, true);
-                break;
+            let last = surface(next.0, next.1).point.distance_squared(p);
+            if level(last, d2) {
+                (uv, d2) = (next, last.min(d2));
             }
-            step *= 0.5;
-        }
-        if !moved {
             break;
         }
+        // A coupled step that is cut at an end may lead uphill; down the slope, each parameter by itself, never does.
+        let moved = descend(&surface, p, (uv, &at, d2), step, ranges).or_else(|| {
+            descend(
+                &surface,
+                p,
+                (uv, &at, d2),
+                slope_step(&at, p, uv, ranges),
+                ranges,
+            )
+        });
+        let Some(moved) = moved else { break };
+        (uv, at, d2) = moved;
     }
     (uv, d2)
+}
+
+type Place = ((f64, f64), SurfaceDerivatives, f64);
+
+/// The place at the end of a step, halved until it is nearer.
+fn descend(
+    surface: &impl Fn(f64, f64) -> SurfaceDerivatives,
+    p: DVec3,
+    (uv, at, d2): ((f64, f64), &SurfaceDerivatives, f64),
+    mut step: DVec2,
+    ranges: [Range; 2],
+) -> Option<Place> {
+    let slope = |s: &SurfaceDerivatives| {
+        let r = s.point - p;
+        s.du.dot(r).abs() / s.du.length().max(f64::MIN_POSITIVE)
+            + s.dv.dot(r).abs() / s.dv.length().max(f64::MIN_POSITIVE)
+    };
+    for _ in 0..MAX_HALVINGS {
+        let next = (
+            ranges[0].bring(uv.0 + step.x),
+            ranges[1].bring(uv.1 + step.y),
+        );
+        let candidate = surface(next.0, next.1);
+        let next_d2 = candidate.point.distance_squared(p);
+        if next_d2 < d2 || (level(next_d2, d2) && slope(&candidate) < 0.5 * slope(at)) {
+            return Some((next, candidate, next_d2));
+        }
+        step *= 0.5;
+    }
+    None
+}
+
+/// Whether two squared distances differ by rounding alone: there the slope tells which place is the nearer.
+fn level(next_d2: f64, d2: f64) -> bool {
+    next_d2 <= d2 * (1.0 + 8.0 * f64::EPSILON)
+}
+
+/// Down the slope, each free parameter by itself.
+fn slope_step(at: &SurfaceDerivatives, p: DVec3, uv: (f64, f64), ranges: [Range; 2]) -> DVec2 {
+    let r = at.point - p;
+    let alone = |derivative: DVec3, t: f64, range: Range| {
+        let step = -derivative.dot(r) / derivative.length_squared();
+        if step.is_finite() && !range.blocks(t, step) {
+            step
+        } else {
+            0.0
+        }
+    };
+    DVec2::new(alone(at.du, uv.0, ranges[0]), alone(at.dv, uv.1, ranges[1]))
 }
 
 /// A descent step in the parameters that are free: those not held at an open end.

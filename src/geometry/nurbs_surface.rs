@@ -172,7 +172,7 @@ impl NurbsSurface {
         for i in 0..cells.centres.len() {
             let bound = reach + cells.radii[i];
             let d = d2(i);
-            if d < bound * bound && i != first.0 && cells.is_lowest(i, d, self.closed, d2) {
+            if d < bound * bound && i != first.0 {
                 let found = refine(cells.uv(i));
                 if found.1 < best.1 {
                     best = found;
@@ -301,28 +301,129 @@ impl Cells {
     fn uv(&self, i: usize) -> (f64, f64) {
         (self.u[i / self.v.len()], self.v[i % self.v.len()])
     }
+}
 
-    /// Whether no neighbour in the grid is nearer.
-    fn is_lowest(&self, i: usize, d: f64, closed: [bool; 2], d2: impl Fn(usize) -> f64) -> bool {
-        let (nu, nv) = (self.u.len() as isize, self.v.len() as isize);
-        let (row, column) = ((i / self.v.len()) as isize, (i % self.v.len()) as isize);
-        for dr in -1..=1 {
-            for dc in -1..=1 {
-                let (mut r, mut c) = (row + dr, column + dc);
-                if closed[0] {
-                    r = r.rem_euclid(nu);
-                }
-                if closed[1] {
-                    c = c.rem_euclid(nv);
-                }
-                if r < 0 || c < 0 || r >= nu || c >= nv {
-                    continue;
-                }
-                if d2((r * nv + c) as usize) < d {
-                    return false;
-                }
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::FRAC_1_SQRT_2;
+
+    /// An eighth of the unit sphere as a rational biquadratic patch with a pole (Piegl and Tiller, section 8.2).
+    fn octant() -> NurbsSurface {
+        let arc = [(1.0, 0.0, 1.0), (1.0, 1.0, FRAC_1_SQRT_2), (0.0, 1.0, 1.0)];
+        let mut points = Vec::new();
+        let mut weights = Vec::new();
+        for (x, y, w) in arc {
+            for (r, z, v) in arc {
+                points.push(DVec3::new(r * x, r * y, z));
+                weights.push(w * v);
             }
         }
-        true
+        let knots = vec![0., 0., 0., 1., 1., 1.];
+        let shape = NurbsShape {
+            degrees: [2, 2],
+            counts: [3, 3],
+            knots: [knots.clone(), knots],
+        };
+        NurbsSurface::new(shape, &points, Some(&weights)).expect("a patch")
+    }
+
+    /// A bicubic surface with hills, 6 x 5 control points.
+    fn hills() -> NurbsSurface {
+        let mut points = Vec::new();
+        for i in 0..6 {
+            for j in 0..5 {
+                let (x, y) = (f64::from(i) * 10.0, f64::from(j) * 8.0);
+                points.push(DVec3::new(x, y, 9.0 * (0.21 * x).sin() * (0.19 * y).cos()));
+            }
+        }
+        let shape = NurbsShape {
+            degrees: [3, 3],
+            counts: [6, 5],
+            knots: [
+                vec![0., 0., 0., 0., 0.3, 0.7, 1., 1., 1., 1.],
+                vec![0., 0., 0., 0., 2., 3., 3., 3., 3.],
+            ],
+        };
+        NurbsSurface::new(shape, &points, None).expect("a surface")
+    }
+
+    #[test]
+    fn the_rational_octant_is_a_sphere() {
+        let s = octant();
+        for i in 0..=10 {
+            for j in 0..=10 {
+                let (u, v) = (f64::from(i) * 0.1, f64::from(j) * 0.1);
+                let d = s.derivatives(u, v);
+                assert!((d.point.length() - 1.0).abs() < 1e-14);
+                assert!(d.point.dot(d.du).abs() < 1e-13 && d.point.dot(d.dv).abs() < 1e-13);
+                // |S|^2 = 1 differentiated twice.
+                assert!((d.point.dot(d.duu) + d.du.length_squared()).abs() < 1e-12);
+                assert!((d.point.dot(d.duv) + d.du.dot(d.dv)).abs() < 1e-12);
+                assert!((d.point.dot(d.dvv) + d.dv.length_squared()).abs() < 1e-12);
+                assert!((s.point(u, v) - d.point).length() < 1e-15);
+            }
+        }
+    }
+
+    #[test]
+    fn the_nearest_point_of_the_octant_is_on_the_ray_from_its_centre() {
+        let s = octant();
+        for k in 1..40 {
+            let a = f64::from(k) * 0.039;
+            let ray = DVec3::new(a.cos() * 0.8, a.sin() * 0.8, 0.6);
+            let (_, d) = s.nearest(ray * 1.7, None);
+            assert!((d - 0.7).abs() < 1e-12);
+            let (uv, _) = s.nearest(ray * 0.6, None);
+            assert!((s.point(uv.0, uv.1) - ray).length() < 1e-7);
+        }
+    }
+
+    #[test]
+    fn derivatives_agree_with_central_differences() {
+        let s = hills();
+        let h = 1e-5;
+        for (u, v) in [(0.13, 0.4), (0.5, 1.9), (0.85, 2.7)] {
+            let d = s.derivatives(u, v);
+            let by = |du: f64, dv: f64| s.derivatives(u + du, v + dv);
+            // Truncation h^2 times third derivatives of 1e4; rounding 1e-14 / h.
+            let close = |a: DVec3, b: DVec3| (a - b).length() < 1e-5 * (1.0 + a.length());
+            assert!(close(
+                d.du,
+                (by(h, 0.0).point - by(-h, 0.0).point) / (2.0 * h)
+            ));
+            assert!(close(
+                d.dv,
+                (by(0.0, h).point - by(0.0, -h).point) / (2.0 * h)
+            ));
+            assert!(close(d.duu, (by(h, 0.0).du - by(-h, 0.0).du) / (2.0 * h)));
+            assert!(close(d.duv, (by(0.0, h).du - by(0.0, -h).du) / (2.0 * h)));
+            assert!(close(d.dvv, (by(0.0, h).dv - by(0.0, -h).dv) / (2.0 * h)));
+        }
+    }
+
+    #[test]
+    fn the_cold_search_never_misses_what_sampling_finds() {
+        let s = hills();
+        let grid = 160;
+        let samples: Vec<DVec3> = (0..=grid)
+            .flat_map(|i| (0..=grid).map(move |j| (i, j)))
+            .map(|(i, j)| s.point(f64::from(i) / 160.0, 3.0 * f64::from(j) / 160.0))
+            .collect();
+        for k in 0..400 {
+            let a = f64::from(k);
+            let p = DVec3::new(
+                25.0 + 40.0 * (1.7 * a).sin(),
+                16.0 + 30.0 * (2.3 * a).cos(),
+                25.0 * (0.9 * a).sin(),
+            );
+            let sampled = samples
+                .iter()
+                .map(|q| q.distance(p))
+                .fold(f64::INFINITY, f64::min);
+            let (uv, d) = s.nearest(p, None);
+            assert!(d <= sampled + 1e-9, "{p}: {d}, but a sample at {sampled}");
+            assert!((s.point(uv.0, uv.1).distance(p) - d).abs() < 1e-12);
+        }
     }
 }

@@ -264,3 +264,124 @@ fn turned(
         dvv: out * ddr + frame.z * ddh,
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::Curve;
+    use super::*;
+
+    fn all() -> Vec<Surface> {
+        let frame = Frame::new(
+            DVec3::new(1.0, 2.0, 3.0),
+            DVec3::new(0.3, -0.2, 1.0),
+            DVec3::X,
+        )
+        .expect("a frame");
+        let torus = |major_mm, minor_mm| Surface::Torus {
+            frame,
+            major_mm,
+            minor_mm,
+        };
+        let ellipse = Curve::Ellipse {
+            frame: Frame::new(frame.origin + frame.x * 9.0, frame.y, frame.x).expect("a frame"),
+            semi_axes_mm: [3.0, 1.5],
+        };
+        let revolved = Sweep::around(ellipse.clone(), frame).expect("a closed profile");
+        let extruded = Sweep::along(ellipse, DVec3::new(0.2, 1.0, 0.1)).expect("a closed profile");
+        vec![
+            Surface::Plane(frame),
+            Surface::Cylinder {
+                frame,
+                radius_mm: 4.0,
+            },
+            Surface::Cone {
+                frame,
+                radius_mm: 3.0,
+                half_angle_rad: 0.5,
+            },
+            Surface::Sphere {
+                frame,
+                radius_mm: 5.0,
+            },
+            torus(6.0, 2.0),
+            torus(1.0, 5.0),
+            torus(-1.0, 5.0),
+            Surface::Swept(Box::new(revolved)),
+            Surface::Swept(Box::new(extruded)),
+        ]
+    }
+
+    #[test]
+    fn derivatives_agree_with_central_differences() {
+        let h = 1e-5;
+        for s in all() {
+            for (u, v) in [(0.4, 0.3), (2.0, -0.7), (5.5, 1.1)] {
+                let d = s.derivatives(u, v);
+                let by = |du: f64, dv: f64| s.derivatives(u + du, v + dv);
+                // Truncation h^2 times third derivatives of 10; rounding 1e-15 / h.
+                let close = |a: DVec3, b: DVec3| (a - b).length() < 1e-8;
+                assert!(
+                    close(d.du, (by(h, 0.0).point - by(-h, 0.0).point) / (2.0 * h)),
+                    "{}",
+                    s.kind()
+                );
+                assert!(
+                    close(d.dv, (by(0.0, h).point - by(0.0, -h).point) / (2.0 * h)),
+                    "{}",
+                    s.kind()
+                );
+                assert!(
+                    close(d.duu, (by(h, 0.0).du - by(-h, 0.0).du) / (2.0 * h)),
+                    "{}",
+                    s.kind()
+                );
+                assert!(
+                    close(d.duv, (by(0.0, h).du - by(0.0, -h).du) / (2.0 * h)),
+                    "{}",
+                    s.kind()
+                );
+                assert!(
+                    close(d.dvv, (by(0.0, h).dv - by(0.0, -h).dv) / (2.0 * h)),
+                    "{}",
+                    s.kind()
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn no_sample_is_nearer_than_the_nearest_point() {
+        for s in all() {
+            let [ru, rv] = s.ranges();
+            let end = |t: f64, instead: f64| if t.is_finite() { t } else { instead };
+            let (u0, u1) = (end(ru.from, -30.0), end(ru.to, 30.0));
+            let (v0, v1) = (end(rv.from, -30.0), end(rv.to, 30.0));
+            let mut samples = Vec::new();
+            for i in 0..=90 {
+                for j in 0..=90 {
+                    let at = |a: f64, b: f64, k: i32| a + (b - a) * f64::from(k) / 90.0;
+                    samples.push(s.point(at(u0, u1, i), at(v0, v1, j)));
+                }
+            }
+            for k in 0..40 {
+                let a = f64::from(k);
+                let p = DVec3::new(
+                    9.0 * (1.7 * a).sin(),
+                    9.0 * (2.3 * a).cos(),
+                    3.0 + 8.0 * (0.9 * a).sin(),
+                );
+                let (u, v) = s.nearest(p, None);
+                let d = s.point(u, v).distance(p);
+                let sampled = samples
+                    .iter()
+                    .map(|q| q.distance(p))
+                    .fold(f64::INFINITY, f64::min);
+                assert!(
+                    d <= sampled + 1e-9,
+                    "{}: {d}, but a sample at {sampled}",
+                    s.kind()
+                );
+            }
+        }
+    }
+}

@@ -231,7 +231,8 @@ impl<B: Body> Task<'_, B> {
             return self.failed(TOO_FEW.to_string());
         };
         let fine = self.scan.subset(FINAL_POINTS);
-        let gate = (0.01 * self.size_mm).max(10.0 * self.scan.noise_mm);
+        // Wide enough that a face which is off stays in sight and is counted as form.
+        let gate = (0.05 * self.size_mm).max(10.0 * self.scan.noise_mm);
         let mut last = None;
         for _ in 0..12 {
             let observations = self.observe(&pose, &fine, gate);
@@ -434,14 +435,10 @@ impl<B: Body> Task<'_, B> {
                 &scaling,
             )
         };
-        let by_face = form_by(|o, _| u64::from(o.face));
-        let by_patch = form_by(patch_of);
-        let larger = if by_face.trace() > by_patch.trace() {
-            by_face
-        } else {
-            by_patch
-        };
-        let mut scaled = inverse * self.white_variance(observations, step) + larger;
+        // Faces shift, and patches bend and tilt them: the first moves the part, the second turns it.
+        let faces = form_by(|o, _| u64::from(o.face));
+        let patches = form_by(patch_of);
+        let mut scaled = inverse * self.white_variance(observations, step) + faces + patches;
         for weak in &step.weak {
             scaled += weak * weak.transpose() * self.size_mm.powi(2);
         }
@@ -471,10 +468,14 @@ fn patch_of(o: &Observation, size_mm: f64) -> u64 {
     u64::from(o.face) << 40 | (place as u64 & 0xFF_FFFF_FFFF)
 }
 
+/// Variance of the median of normal noise over that of the mean: pi / 2.
+const MEDIAN_VARIANCE: f64 = std::f64::consts::FRAC_PI_2;
+
 /// What the pose may be off because faces, or patches of them, depart from the nominal by amounts that nobody knows.
 ///
-/// Every group is taken to be shifted at random; the variance of the shifts is estimated from the mean residuals of *all*
+/// Every group is taken to be shifted at random; the variance of the shifts is estimated from the median residuals of *all*
 /// groups, those that the robust fit turned down included: which of two opposite faces is off cannot be told from the scan.
+/// The median, because the points of an edge break or of the spot's smear at a face's rim are no shift of the face.
 /// Where no group is redundant (three datum faces) the shifts cannot be seen, and the groups define the frame.
 fn form(
     observations: &[Observation],
@@ -482,8 +483,8 @@ fn form(
     group: impl Fn(&Observation) -> u64,
     scaling: &[f64; 6],
 ) -> Matrix6<f64> {
-    // By group: weighted sum of rows, sum of weights, sum of residuals, of their squares, count.
-    let mut groups: BTreeMap<u64, (Vector6<f64>, f64, [f64; 3])> = BTreeMap::new();
+    // By group: weighted sum of rows, sum of weights, residuals.
+    let mut groups: BTreeMap<u64, (Vector6<f64>, f64, Vec<f64>)> = BTreeMap::new();
     for (o, w) in observations.iter().zip(&step.weights) {
         if o.u_mm > 0.0 {
             continue;
@@ -491,24 +492,24 @@ fn form(
         let entry = groups.entry(group(o)).or_default();
         entry.0 += *w * Vector6::from_fn(|k, _| o.row[k] * scaling[k]);
         entry.1 += w;
-        entry.2[0] += o.residual_mm;
-        entry.2[1] += o.residual_mm.powi(2);
-        entry.2[2] += 1.0;
+        entry.2.push(o.residual_mm);
     }
     let total = observations.len() as f64;
     let (mut square, mut expected, mut freedom) = (0.0, 0.0, 0.0);
     let mut scatter = Matrix6::zeros();
-    for (rows, weight, [sum, sum_square, count]) in groups.values() {
-        scatter += rows * rows.transpose();
+    for (rows, weight, residuals) in groups.values_mut() {
+        scatter += *rows * rows.transpose();
+        let count = residuals.len() as f64;
         // A handful of stray points is no face.
-        if *count < 20.0f64.max(0.002 * total) {
+        if count < 20.0f64.max(0.002 * total) {
             continue;
         }
-        let mean = sum / count;
-        let leverage = (rows.transpose() * inverse * rows)[0] / weight.max(1e-9);
+        let middle = median(residuals);
+        let sigma = mad_sigma(residuals);
+        let leverage = (rows.transpose() * inverse * *rows)[0] / weight.max(1e-9);
         let left = (1.0 - leverage).clamp(0.0, 1.0);
-        square += mean * mean;
-        expected += left * (sum_square / count - mean * mean).max(0.0) / count;
+        square += middle * middle;
+        expected += left * MEDIAN_VARIANCE * sigma * sigma / count;
         freedom += left;
     }
     let excess = square - expected;

@@ -115,7 +115,14 @@ pub enum FlankGap {
     BadlySpread,
     /// The points reach less far from the edge than the extrapolation to it: (first, last) distance, mm.
     ShortReach(f64, f64),
+    /// The points lie on a plane turned by this angle (rad) against the face: an edge break, not the face.
+    Turned(f64),
 }
+
+/// A flank turned by more than this against its nominal face is another surface: the steepest draft and the worst clamping we
+/// know of stay below 5 degrees, while an edge break with a land of its own (a chamfer of 15 by 75 degrees is the flattest in use)
+/// turns by 15 or more.
+const TURN_MAX_RAD: f64 = 10.0 * std::f64::consts::PI / 180.0;
 
 /// One flank along a whole edge.
 #[derive(Debug, Clone, PartialEq)]
@@ -328,6 +335,10 @@ fn finish<const P: usize, const Q: usize>(
         .zip(noise.iter().zip(form))
         .map(|(window, (noise, form))| {
             let window = window?;
+            let turn_rad = window.fit.coefficients[1].atan().abs();
+            if turn_rad > TURN_MAX_RAD {
+                return Err(FlankGap::Turned(turn_rad));
+            }
             let covariance = noise.covariance(&window).map(|row| row.map(|v| v * form));
             Ok(FlankFit {
                 offset_mm: window.fit.coefficients[0],
@@ -349,4 +360,8 @@ fn finish<const P: usize, const Q: usize>(
 }
 
 #[cfg(test)]
+#[allow(
+    clippy::print_stdout,
+    reason = "the figures are to be seen with --nocapture"
+)]
 mod tests;

@@ -7,7 +7,7 @@ use super::assign::{Place, Surface};
 use super::body::{Body, BodyEdge};
 use super::collect::{self, Scene, Track};
 use super::flank::{FlankFit, FlankGap, FlankSeries, FlankSettings, Windows, measure_flank};
-use super::result::Measured;
+use super::result::{EdgeMean, Measured};
 use super::virtual_edge::{VirtualEdge, intersect};
 use crate::nominal::Station;
 use crate::points::PointCloud;
@@ -49,15 +49,6 @@ pub struct MeasuredEdge {
     pub mean: Option<EdgeMean>,
     /// What was peculiar, for the findings.
     pub remarks: Vec<String>,
-}
-
-/// Mean deviation of an edge.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct EdgeMean {
-    /// Means of d1 and d2, mm.
-    pub d_mm: [f64; 2],
-    /// Their standard uncertainties, what stations share included, mm.
-    pub u_d_mm: [f64; 2],
 }
 
 /// One station as measured.
@@ -356,6 +347,10 @@ fn gap_text(gap: &FlankGap) -> String {
         FlankGap::BadlySpread => "points bunched along the edge".to_string(),
         FlankGap::ShortReach(first, last) => format!(
             "points only {first:.3} to {last:.3} mm from the edge, too short a reach to extrapolate"
+        ),
+        FlankGap::Turned(angle_rad) => format!(
+            "turned by {:.0} degrees against the face: an edge break or another surface",
+            angle_rad.to_degrees()
         ),
     }
 }

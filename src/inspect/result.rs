@@ -84,8 +84,19 @@ pub struct EdgeResult {
     pub coverage: f64,
     /// In order of arc length.
     pub stations: Vec<StationResult>,
+    /// Mean deviations over the measured stations; `None` where none was measured.
+    pub mean: Option<EdgeMean>,
     /// Worst of the stations against the limits of the recipe.
     pub verdict: Verdict,
+}
+
+/// Mean deviation of an edge.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EdgeMean {
+    /// Means of d1 and d2, mm.
+    pub d_mm: [f64; 2],
+    /// Their standard uncertainties, what the stations share included, mm.
+    pub u_d_mm: [f64; 2],
 }
 
 /// One station as measured; `measured` is `None` where it was not.

@@ -38,6 +38,7 @@ pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
         faces: Vec::new(),
         edges: Vec::new(),
         wires: Vec::new(),
+        loose_points: Vec::new(),
         refused,
         refused_faces: 0,
     };
@@ -119,6 +120,7 @@ struct Builder<'a> {
     faces: Vec<Face>,
     edges: Vec<BuiltEdge>,
     wires: Vec<Wire>,
+    loose_points: Vec<DVec3>,
     refused: Vec<Refused>,
     refused_faces: usize,
 }
@@ -396,7 +398,7 @@ impl<'a> Builder<'a> {
         super::unroll::unroll(surface, &points)
     }
 
-    /// The curves of a GEOMETRIC_CURVE_SET; its points are passed over.
+    /// The curves of a GEOMETRIC_CURVE_SET; its points count in the box alone.
     fn wireframe(&mut self, place: &Placed) {
         let shapes = Shapes {
             file: self.file,
@@ -405,6 +407,9 @@ impl<'a> Builder<'a> {
         let items = self.file.record(place.body).and_then(|r| r.references(1));
         for item in items.unwrap_or_default() {
             if self.file.is(item, "CARTESIAN_POINT") {
+                let point = self.file.point(item, place.units);
+                self.loose_points
+                    .extend(point.map(|p| place.root_from_body.point(p)));
                 continue;
             }
             match shapes.bounded_curves(item) {
@@ -436,9 +441,8 @@ impl<'a> Builder<'a> {
             let path = Path::new(w.curve.clone(), w.range);
             path.polyline(CHORD * w.length_mm)
         });
-        let bounding_box_mm = wires.fold(faces_box_mm, |[low, high], (_, p)| {
-            [low.min(p), high.max(p)]
-        });
+        let loose = wires.map(|(_, p)| p).chain(self.loose_points);
+        let bounding_box_mm = loose.fold(faces_box_mm, |[low, high], p| [low.min(p), high.max(p)]);
         let edges = self.edges.into_iter().map(|e| {
             let mut faces: Vec<u32> = e.uses.iter().map(|u| u.face).collect();
             faces.sort_unstable();
@@ -494,12 +498,13 @@ fn sharp_of(e: &BuiltEdge, faces: &[Face]) -> Vec<SharpEdge> {
     if a.face == b.face || e.path.length_mm() <= 0.0 {
         return Vec::new();
     }
-    let sides = [a.side, b.side];
-    let joint = Joint {
+    let mut joint = Joint {
         path: &e.path,
         faces: [&faces[a.face as usize], &faces[b.face as usize]],
-        sides,
+        sides: [a.side, b.side],
     };
+    joint.correct_sides();
+    let sides = joint.sides;
     let whole = (0.0, e.path.length_mm());
     let stretches = joint.sharp_stretches();
     let cut = |(from, to, kind)| {

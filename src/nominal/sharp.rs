@@ -163,6 +163,27 @@ impl Joint<'_> {
         self.faces[i].foot(point, None)
     }
 
+    /// Turns the direction into a face where a step that way leaves it and the other way stays: loops of some files
+    /// run against the sense of their faces.
+    pub fn correct_sides(&mut self) {
+        let length_mm = self.path.length_mm();
+        let Some(at) = self.station(0.5 * length_mm, &mut [None; 2]) else {
+            return;
+        };
+        for i in 0..2 {
+            let inside = |step_mm: f64| {
+                let p = at.point + at.into_face[i] * step_mm;
+                let foot = self.faces[i].foot(p, None);
+                foot.is_some_and(|f| self.faces[i].contains(f.uv))
+            };
+            // Longer than the chord of the borders, shorter than any face worth measuring.
+            let step_mm = 2e-4 * length_mm;
+            if !inside(step_mm) && inside(-step_mm) {
+                self.sides[i] = -self.sides[i];
+            }
+        }
+    }
+
     fn meeting(&self, s_mm: f64, hints: &mut Hints) -> Meeting {
         let Some(at) = self.station(s_mm, hints) else {
             return Meeting::Smooth;

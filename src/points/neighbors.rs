@@ -80,21 +80,10 @@ impl Neighbors {
 
     /// All places nearer to `p` than `radius_mm`, into `out` as (input index, squared distance in mm²), nearest first.
     pub fn within(&self, p: DVec3, radius_mm: f64, out: &mut Vec<(u32, f64)>) {
-        out.clear();
-        let (Some(tree), true) = (&self.tree, p.is_finite() && radius_mm.is_finite()) else {
-            return;
-        };
-        let found = tree
-            .query(&self.inside(p))
-            .within::<SquaredEuclidean<f64>>(radius_mm * radius_mm)
-            .unsorted()
-            .execute();
-        out.extend(
-            found
-                .iter()
-                .map(|hit| (self.places[hit.item as usize], hit.distance)),
-        );
-        sort_by_distance(out);
+        self.within_places(p, radius_mm, out);
+        for entry in out.iter_mut() {
+            entry.0 = self.places[entry.0 as usize];
+        }
     }
 
     /// Input indices of all finite points in an order that keeps neighbours together; queries in this order are the fastest.
@@ -121,6 +110,21 @@ impl Neighbors {
         let found = tree
             .query(&self.inside(p))
             .nearest_n::<SquaredEuclidean<f64>>(k)
+            .execute();
+        out.extend(found.iter().map(|hit| (hit.item, hit.distance)));
+        sort_by_distance(out);
+    }
+
+    /// As [`Neighbors::within`], with ranks in [`Neighbors::places`] in place of input indices.
+    pub(crate) fn within_places(&self, p: DVec3, radius_mm: f64, out: &mut Vec<(u32, f64)>) {
+        out.clear();
+        let (Some(tree), true) = (&self.tree, p.is_finite() && radius_mm.is_finite()) else {
+            return;
+        };
+        let found = tree
+            .query(&self.inside(p))
+            .within::<SquaredEuclidean<f64>>(radius_mm * radius_mm)
+            .unsorted()
             .execute();
         out.extend(found.iter().map(|hit| (hit.item, hit.distance)));
         sort_by_distance(out);

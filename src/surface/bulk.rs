@@ -4,9 +4,11 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::flank::Nearest;
-use super::lines;
+use super::lines::{self, Sighting};
 use super::robust::robust_normal;
-use super::{LINE_SPACING, Meetings, Place, Scale, Scratch, Settings, Surface, SurfaceError};
+use super::{
+    LINE_SPACING, Meetings, Outcome, Place, Scale, Scratch, Settings, Surface, SurfaceError,
+};
 use crate::points::{Neighbors, PointCloud};
 
 /// Points whose results are held at once, before they go to their places.
@@ -62,6 +64,8 @@ struct Landed {
     index: u32,
     position: DVec3,
     normal: Vec3,
+    /// As [`Surface`] keeps it.
+    trust: u8,
     state: State,
 }
 
@@ -146,19 +150,13 @@ pub(super) fn prepare(surface: &mut Surface, mut sink: Option<Sink>) -> Vec<u32>
         for point in landed {
             let index = point.index as usize;
             surface.normals[index] = point.normal;
+            surface.trust[index] = point.trust;
             if point.state == State::Suspicious {
                 suspicious.push(point.index);
             } else if let Some(sink) = &mut sink {
                 sink.positions[index] = point.position;
                 sink.projected[index] = true;
             }
-        }
-    }
-    for block in suspicious.chunks(BLOCK) {
-        let looked = in_parallel(block, |index, scratch| surface.second_look(index, scratch));
-        for (&index, (normal, trust)) in block.iter().zip(looked) {
-            surface.normals[index as usize] = normal;
-            surface.trust[index as usize] = trust;
         }
     }
     suspicious
@@ -177,29 +175,28 @@ fn in_parallel<T: Send>(block: &[u32], work: impl Fn(u32, &mut Scratch) -> T + S
 impl Surface<'_> {
     fn first_look(&self, index: u32, scratch: &mut Scratch) -> Landed {
         let p = self.positions[index as usize];
-        self.gather(p, self.scale.points, scratch);
-        match self.smooth_outcome(scratch) {
-            Some(outcome) => Landed {
+        self.gather_places(p, self.scale.points, scratch);
+        if let Some(outcome) = self.smooth_outcome(scratch) {
+            return Landed {
                 index,
                 position: p + outcome.nearest.position,
                 normal: outcome.nearest.normals[0].as_vec3(),
+                trust: u8::MAX,
                 state: State::Smooth,
-            },
-            None => Landed {
-                index,
-                position: p,
-                normal: Vec3::ZERO,
-                state: State::Suspicious,
-            },
+            };
         }
-    }
-
-    fn second_look(&self, index: u32, scratch: &mut Scratch) -> (Vec3, u8) {
-        let p = self.positions[index as usize];
-        self.gather(p, self.scale.points_near(), scratch);
-        match robust_normal(&scratch.hood.points, &self.scale) {
-            Some((normal, trust)) => (normal.as_vec3(), (trust * 255.0) as u8),
-            None => (Vec3::Z, 0),
+        let near = scratch.hood.points.len().min(self.scale.points_near());
+        // Where scan lines lie far apart the nearest points are all on one of them: then all have their say.
+        let found = robust_normal(&scratch.hood.points[..near], &self.scale)
+            .filter(|(_, trust)| *trust > 0.25)
+            .or_else(|| robust_normal(&scratch.hood.points, &self.scale));
+        let (normal, trust) = found.map_or((Vec3::Z, 0), |(n, t)| (n.as_vec3(), (t * 255.0) as u8));
+        Landed {
+            index,
+            position: p,
+            normal,
+            trust,
+            state: State::Suspicious,
         }
     }
 
@@ -213,7 +210,7 @@ impl Surface<'_> {
 #[derive(Default)]
 struct Features {
     sharp: Vec<SharpPoint>,
-    lines: Vec<LinePoint>,
+    lines: Vec<Sighting>,
 }
 
 impl Features {
@@ -236,12 +233,16 @@ impl Features {
             for (&index, (nearest, meetings)) in block.iter().zip(landed) {
                 let p = cloud.positions[index as usize];
                 self.lines
-                    .extend(meetings.iter().flatten().map(|m| line_point(p, m)));
+                    .extend(meetings.iter().flatten().map(|m| Sighting {
+                        line: line_point(p, m),
+                        distance: m.position.length() / surface.scale.spacing_mm,
+                    }));
                 let Some(nearest) = nearest else {
                     put(Landed {
                         index,
                         position: p,
                         normal: Vec3::ZERO,
+                        trust: 0,
                         state: State::Lost,
                     });
                     continue;
@@ -257,6 +258,7 @@ impl Features {
                     index,
                     position: p + nearest.position,
                     normal: nearest.normals[0].as_vec3(),
+                    trust: u8::MAX,
                     state: State::Smooth,
                 });
             }
@@ -292,22 +294,20 @@ fn land_one(
         surface.gather(p, surface.scale.points_wide(), scratch);
         surface.sharp_outcome(scratch)
     };
+    let longest = surface.longest_way_mm();
+    let fits = |outcome: &Outcome| outcome.nearest.position.length() <= longest;
+    // On a face that the rays graze the scan lines lie several times farther apart than elsewhere: then a wider look helps.
+    let outcome = outcome.filter(fits).or_else(|| {
+        surface.gather(p, 3 * surface.scale.points_wide(), scratch);
+        surface.sharp_outcome(scratch).filter(fits)
+    });
     let Some(outcome) = outcome else {
         return (None, Meetings::default());
     };
-    let longest = surface.longest_way_mm();
     // Lines are sampled from as far as the flanks' own points reach beyond doubt.
     let near = longest + 1.5 * surface.scale.spacing_mm;
     let meetings = outcome
         .meetings
         .map(|m| m.filter(|m| m.position.length() < near));
-    let nearest = Some(outcome.nearest).filter(|n| n.position.length() <= longest);
-    (
-        nearest,
-        if nearest.is_some() {
-            meetings
-        } else {
-            Meetings::default()
-        },
-    )
+    (Some(outcome.nearest), meetings)
 }

@@ -3,7 +3,7 @@
 use glam::{DMat3, DVec3};
 
 use super::levin::{Foot, LocalSurface, Smoothing, fit, gaussian, weighted_normal};
-use super::polynomial::LocalFrame;
+use super::polynomial::{Degree, Equations, LocalFrame};
 use super::scale::Scale;
 
 /// More flanks than this around one point are not told apart.
@@ -93,9 +93,12 @@ impl Neighborhood {
                 flanks.push(flank);
             }
         }
-        for _ in 0..2 {
+        for round in 0..2 {
             self.choose(&flanks, scale);
             flanks = self.refit(flanks, (scale, smoothing));
+            if round == 0 {
+                self.crease(&mut flanks, scale);
+            }
         }
         self.choose(&flanks, scale);
         flanks
@@ -125,7 +128,7 @@ impl Neighborhood {
         };
         let mut wide = *smoothing;
         let mut flank = None;
-        for (stride, bend) in [(0.5, 0.04), (0.9, 0.02), (2.0, 0.01)] {
+        for (stride, bend) in [(0.5, 0.1), (0.9, 0.03), (2.0, 0.01)] {
             let reach = stride * radius;
             self.members.clear();
             let mut last = Vec::new();
@@ -133,12 +136,12 @@ impl Neighborhood {
                 let far = self.points[i].distance(start);
                 let tolerance =
                     3.0 * scale.noise_mm + scale.floor_mm() + bend * far * far / scale.spacing_mm;
-                if self.labels[i] == NONE
-                    && far < reach
-                    && local.distance(self.points[i]).abs()
-                        < tolerance.min(3.0 * scale.noise_mm + 0.4 * scale.spacing_mm)
-                    && self.agrees(i, &local)
-                {
+                if self.labels[i] != NONE || far >= reach {
+                    continue;
+                }
+                let most = tolerance.min(3.0 * scale.noise_mm + 0.4 * scale.spacing_mm);
+                let (off, normal) = local.look(self.points[i]);
+                if off.abs() < most && self.agrees(i, normal) {
                     self.members.push(self.points[i]);
                     last.push(i);
                 }
@@ -163,23 +166,41 @@ impl Neighborhood {
         Some(Flank { local })
     }
 
-    /// Whether neighbour `i`'s own normal speaks for the surface, or says nothing.
-    fn agrees(&self, i: usize, local: &LocalSurface) -> bool {
+    /// Whether neighbour `i`'s own normal speaks for a surface of this `normal`, or says nothing.
+    fn agrees(&self, i: usize, normal: DVec3) -> bool {
         const COS_35_DEGREES: f64 = 0.82;
-        self.trust[i] < 0.4
-            || self.normals[i].dot(local.normal_near(self.points[i])).abs() > COS_35_DEGREES
+        self.trust[i] < 0.4 || self.normals[i].dot(normal).abs() > COS_35_DEGREES
+    }
+
+    /// Splits every flank whose points two planes explain better than one quadric does, which has as many coefficients.
+    ///
+    /// Blunt edges grow into one flank, the more easily the more noise there is; this finds them again.
+    fn crease(&mut self, flanks: &mut Vec<Flank>, scale: &Scale) {
+        let sigma = scale.noise_mm + scale.floor_mm();
+        for label in 0..flanks.len() {
+            if flanks.len() == FLANKS_MAX
+                || flanks[label].local.polynomial.residual_mm < 1.15 * sigma
+            {
+                continue;
+            }
+            self.choose(flanks, scale);
+            let members: Vec<DVec3> = self.members(label).collect();
+            if let Some([one, other]) = roof(&members, &flanks[label].local.frame, sigma) {
+                flanks[label].local = one;
+                flanks.push(Flank { local: other });
+            }
+        }
     }
 
     /// Gives every neighbour to the flank that explains its position and its normal best.
     fn choose(&mut self, flanks: &[Flank], scale: &Scale) {
-        let width = scale.noise_mm + 2.0 * scale.floor_mm();
+        let width = scale.noise_mm + 3.0 * scale.floor_mm();
         for i in 0..self.points.len() {
             let mut best = (NONE, 16.0);
             for (label, flank) in flanks.iter().enumerate() {
-                let off = flank.local.distance(self.points[i]) / width;
-                let cosine = self.normals[i]
-                    .dot(flank.local.normal_near(self.points[i]))
-                    .abs();
+                let (off, normal) = flank.local.look(self.points[i]);
+                let off = off / width;
+                let cosine = self.normals[i].dot(normal).abs();
                 // An angle of 30 degrees counts as much as a distance of one sigma, as far as the normal is trusted.
                 let turn = self.trust[i] * (1.0 - cosine.min(1.0)) / 0.134;
                 let cost = off * off + turn;
@@ -244,6 +265,61 @@ impl Neighborhood {
         let polynomial = fit(&self.members, &frame, smoothing)?;
         Some(LocalSurface { frame, polynomial })
     }
+}
+
+/// The two planes that explain the points better than a quadric over `frame`, by more than chance would under noise of `sigma_mm`.
+fn roof(points: &[DVec3], frame: &LocalFrame, sigma_mm: f64) -> Option<[LocalSurface; 2]> {
+    /// Residual squares, in squares of sigma, that two planes must take away: chance does so once in hundreds of neighbourhoods.
+    const GAIN: f64 = 14.0;
+    const LEAST: usize = 6;
+    if points.len() < 3 * LEAST {
+        return None;
+    }
+    let inside: Vec<DVec3> = points.iter().map(|p| frame.inside(*p)).collect();
+    let scale_mm = inside
+        .iter()
+        .map(|p| p.truncate().length())
+        .fold(f64::MIN_POSITIVE, f64::max);
+    let fit_all = |degree: Degree, pick: &dyn Fn(&DVec3) -> bool| {
+        let mut equations = Equations::new(degree, scale_mm);
+        equations.add_all(inside.iter().filter(|p| pick(p)).map(|p| (*p, 1.0)));
+        equations
+            .solve(0.0)
+            .map(|polynomial| (polynomial, equations.residual_squares(&polynomial)))
+    };
+    let (quadric, quadric_squares) = fit_all(Degree::Two, &|_| true)?;
+    let across = quadric.jet(0.0, 0.0).steepest_bend();
+    let mut places: Vec<f64> = inside.iter().map(|p| p.truncate().dot(across)).collect();
+    places.sort_unstable_by(f64::total_cmp);
+    let mut best = (quadric_squares - GAIN * sigma_mm * sigma_mm, None);
+    for eighth in 1..8 {
+        let cut = places[places.len() * eighth / 8];
+        let below = |p: &DVec3| p.truncate().dot(across) < cut;
+        let few = places.iter().filter(|x| **x < cut).count();
+        if few < LEAST || places.len() - few < LEAST {
+            continue;
+        }
+        let (Some(one), Some(other)) = (
+            fit_all(Degree::One, &below),
+            fit_all(Degree::One, &|p| !below(p)),
+        ) else {
+            continue;
+        };
+        if one.1 + other.1 < best.0 {
+            best = (one.1 + other.1, Some([one.0, other.0]));
+        }
+    }
+    // Planes that do not explain the points down to the noise are no better than facets of a curved surface.
+    let limit = 1.3 * sigma_mm;
+    if best.0 > points.len() as f64 * limit * limit {
+        return None;
+    }
+    best.1.map(|planes| {
+        planes.map(|polynomial| LocalSurface {
+            frame: *frame,
+            polynomial,
+        })
+    })
 }
 
 /// Weighted mean height of the points over the frame, mm.

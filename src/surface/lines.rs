@@ -7,8 +7,16 @@ use glam::{DVec3, I64Vec3};
 use super::Place;
 use super::bulk::LinePoint;
 
-/// Sightings, that of the sample among them, that make a sample of a line or a corner.
-const SIGHTINGS: usize = 4;
+/// Weight of the sightings that make a sample of a line or a corner; one from on the line itself has weight one.
+const WEIGHT_LEAST: f64 = 2.0;
+
+/// A place on a feature line as one point saw it.
+#[derive(Clone, Copy)]
+pub(super) struct Sighting {
+    pub line: LinePoint,
+    /// How far the point that saw it lies from it, in spacings.
+    pub distance: f64,
+}
 
 /// Things in cells, found by their place.
 pub(super) struct Grid<T> {
@@ -61,30 +69,30 @@ impl Grid<()> {
 
 /// The samples, about `spacing_mm` apart, that enough of the `sightings` agree on; corners come first.
 ///
-/// A sample is the mean of the sightings nearer than the spacing, taken across the line only so that curved lines are not shortened.
-pub(super) fn agree(sightings: Vec<LinePoint>, spacing_mm: f64) -> Vec<LinePoint> {
-    let (corners, edges): (Vec<_>, Vec<_>) = sightings
-        .into_iter()
-        .partition(|l| l.place == Place::Corner);
+/// A sample is the weighted mean of the sightings nearer than the spacing, taken across the line only so that curved lines are not shortened.
+pub(super) fn agree(sightings: Vec<Sighting>, spacing_mm: f64) -> Vec<LinePoint> {
+    let (corners, edges): (Vec<_>, Vec<_>) =
+        (sightings.into_iter()).partition(|s| s.line.place == Place::Corner);
     let mut taken = Grid::new(spacing_mm);
     let mut samples = Vec::new();
-    // Sightings of a corner scatter in all directions; one corner stands for all within two spacings of the samples.
+    // Sightings of a corner scatter in all directions.
     for (sightings, reach) in [(corners, 2.0 * spacing_mm), (edges, spacing_mm)] {
         let mut all = Grid::new(reach);
         for (index, sighting) in sightings.iter().enumerate() {
-            all.add(sighting.position, index);
+            all.add(sighting.line.position, index);
         }
         for sighting in &sightings {
+            let p = sighting.line.position;
             if taken
-                .around(sighting.position)
-                .any(|(q, ())| q.distance(sighting.position) < 0.8 * spacing_mm)
+                .around(p)
+                .any(|(q, ())| q.distance(p) < 0.7 * spacing_mm)
             {
                 continue;
             }
-            let Some(sample) = mean(sighting, (&sightings, &all), reach) else {
+            let Some(sample) = mean(&sighting.line, (&sightings, &all), reach) else {
                 continue;
             };
-            if taken.take(sample.position, 0.8 * spacing_mm) {
+            if taken.take(sample.position, 0.7 * spacing_mm) {
                 samples.push(sample);
             }
         }
@@ -94,29 +102,30 @@ pub(super) fn agree(sightings: Vec<LinePoint>, spacing_mm: f64) -> Vec<LinePoint
 
 fn mean(
     at: &LinePoint,
-    (sightings, all): (&[LinePoint], &Grid<usize>),
+    (sightings, all): (&[Sighting], &Grid<usize>),
     reach: f64,
 ) -> Option<LinePoint> {
     let tangent = at.normals[0]
         .cross(at.normals[1])
         .as_dvec3()
         .normalize_or_zero();
-    let (mut sum, mut count) = (DVec3::ZERO, 0usize);
+    let (mut sum, mut weights) = (DVec3::ZERO, 0.0);
     for (q, index) in all.around(at.position) {
-        let other = sightings[*index].normals;
+        let other = &sightings[*index];
         let same = at
             .normals
             .iter()
-            .all(|n| other.iter().any(|m| n.dot(*m).abs() > 0.9));
+            .all(|n| other.line.normals.iter().any(|m| n.dot(*m).abs() > 0.9));
         if same && q.distance(at.position) < reach {
-            sum += *q - at.position;
-            count += 1;
+            let weight = 1.0 / (1.0 + other.distance * other.distance);
+            sum += (*q - at.position) * weight;
+            weights += weight;
         }
     }
-    if count < SIGHTINGS {
+    if weights < WEIGHT_LEAST {
         return None;
     }
-    let off = sum / count as f64;
+    let off = sum / weights;
     let off = if at.place == Place::Edge {
         off - tangent * off.dot(tangent)
     } else {

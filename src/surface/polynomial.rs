@@ -97,38 +97,51 @@ impl Equations {
         }
     }
 
-    /// Adds one point given in the local frame.
-    #[inline]
-    pub fn add(&mut self, at: DVec3, weight: f64) {
+    /// Adds points given in the local frame, with weights.
+    pub fn add_all(&mut self, points: impl Iterator<Item = (DVec3, f64)>) {
         match self.terms {
-            3 => self.add_terms::<3>(at, weight),
-            6 => self.add_terms::<6>(at, weight),
-            _ => self.add_terms::<10>(at, weight),
+            3 => self.add_terms::<3>(points),
+            6 => self.add_terms::<6>(points),
+            _ => self.add_terms::<10>(points),
         }
     }
 
     #[inline]
-    fn add_terms<const T: usize>(&mut self, at: DVec3, weight: f64) {
+    fn add_terms<const T: usize>(&mut self, points: impl Iterator<Item = (DVec3, f64)>) {
         let inverse = 1.0 / self.scale_mm;
-        let phi = monomials(at.x * inverse, at.y * inverse);
-        for i in 0..T {
-            let row = weight * phi[i];
-            for j in 0..=i {
-                self.matrix[i][j] += row * phi[j];
+        let mut matrix = [[0.0; T]; T];
+        let mut right = [0.0; T];
+        for (at, weight) in points {
+            let phi = monomials(at.x * inverse, at.y * inverse);
+            // All of the square rather than half: the compiler works on two columns at once.
+            for i in 0..T {
+                let row = weight * phi[i];
+                for j in 0..T {
+                    matrix[i][j] += row * phi[j];
+                }
             }
-            self.right[i] += row * at.z;
+            let height = weight * at.z;
+            for i in 0..T {
+                right[i] += height * phi[i];
+            }
+            self.heights += height * at.z;
+            self.weights += weight;
+            self.weights_squared += weight * weight;
+            self.count += 1;
         }
-        self.heights += weight * at.z * at.z;
-        self.weights += weight;
-        self.weights_squared += weight * weight;
-        self.count += 1;
+        for i in 0..T {
+            for j in 0..T {
+                self.matrix[i][j] += matrix[i][j];
+            }
+            self.right[i] += right[i];
+        }
     }
 
     /// The polynomial of least squares, its higher degrees shrunk as far as noise of `sigma_mm` would make them.
     ///
-    /// The part of a degree above one is multiplied by 1 - n s² / q (not below 0), with n its number of terms, s² the noise and q what
-    /// it takes off the sum of squares: positive-part James-Stein. On a plane the fit so becomes nearly that of a plane, with its
-    /// small variance; where the surface curves, nothing changes. Degrees that the points cannot determine are left out; `None` where
+    /// The part of a degree above one is multiplied by 1 - 2 (n - 2) s² / q (not below 0), with n its number of terms, s² the noise and q
+    /// what it takes off the sum of squares: positive-part James-Stein, as strong as it may be without ever being worse than no
+    /// shrinking. On a plane the fit so becomes more like that of a plane, with its small variance; where the surface curves, little changes. Degrees that the points cannot determine are left out; `None` where
     /// they do not even determine a plane.
     pub fn solve(&self, sigma_mm: f64) -> Option<Polynomial> {
         let mut terms = self.terms;
@@ -177,6 +190,14 @@ impl Equations {
             coefficients,
             residual_mm,
         })
+    }
+
+    /// Weighted sum of the squared residuals of the solution `polynomial`, nothing shrunk, mm².
+    pub fn residual_squares(&self, polynomial: &Polynomial) -> f64 {
+        let explained: f64 = (polynomial.coefficients.iter().zip(&self.right))
+            .map(|(c, r)| c * r)
+            .sum();
+        (self.heights - explained).max(0.0)
     }
 
     fn cholesky(&self, terms: usize) -> Option<[[f64; TERMS_MAX]; TERMS_MAX]> {
@@ -231,7 +252,7 @@ fn shrink(y: &mut [f64], variance: f64) {
         let Some(part) = y.get_mut(group) else { return };
         let taken: f64 = part.iter().map(|v| v * v).sum();
         let factor = if taken > 0.0 {
-            (1.0 - part.len() as f64 * variance / taken).max(0.0)
+            (1.0 - 2.0 * (part.len() as f64 - 2.0) * variance / taken).max(0.0)
         } else {
             0.0
         };
@@ -354,6 +375,19 @@ impl Jet {
     /// Unit normal of the graph, in the local frame, on the side of its third axis.
     pub fn normal(&self) -> DVec3 {
         DVec3::new(-self.gradient.x, -self.gradient.y, 1.0).normalize()
+    }
+
+    /// Unit direction, in the frame's plane, in which the second derivative is largest in magnitude.
+    pub fn steepest_bend(&self) -> DVec2 {
+        let [a, b, c] = self.second;
+        let angle = 0.5 * (2.0 * b).atan2(a - c);
+        let first = DVec2::from_angle(angle);
+        let bend = |d: DVec2| (a * d.x * d.x + 2.0 * b * d.x * d.y + c * d.y * d.y).abs();
+        if bend(first) >= bend(first.perp()) {
+            first
+        } else {
+            first.perp()
+        }
     }
 
     /// Principal curvatures, 1/mm, the larger magnitude first; positive where the surface bends towards its normal.

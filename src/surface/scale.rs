@@ -27,7 +27,11 @@ impl Scale {
     /// rests on a part of the points that is at most three times as dense along the lines as across, and every point is still projected.
     pub fn of(cloud: &PointCloud, neighbors: &Neighbors) -> Self {
         let spacing = spacing(cloud, neighbors);
-        let noise_mm = noise_mm(cloud, neighbors, &spacing);
+        let mut noise_mm = noise_mm(cloud, neighbors, &spacing);
+        if !spacing.in_lines() {
+            // Where two sheets lie closer than a neighbourhood everywhere, the distance between them passes for noise.
+            noise_mm = noise_mm.min(1.5 * super::robust::noise_of_planes_mm(cloud, neighbors));
+        }
         let thinning_mm = if spacing.along_mm < LINE_PART * spacing.across_mm {
             LINE_PART * spacing.across_mm
         } else {
@@ -71,7 +75,7 @@ impl Scale {
 /// Points of one projection for a ratio of noise to spacing: enough that a quadric's height at the centre has a third of the noise at a
 /// ratio of 0.1, more where there is more, fewer where nothing needs to be averaged.
 fn points_for(ratio: f64) -> usize {
-    (26.0 + 300.0 * ratio.clamp(0.0, 0.35)) as usize
+    (26.0 + 180.0 * ratio.clamp(0.0, 0.4) + 150.0 * (ratio.min(0.4) - 0.15).max(0.0)) as usize
 }
 
 /// Indices of the points that support the surface, in the order of `neighbors`: no two closer than `distance_mm`.

@@ -73,6 +73,12 @@ pub enum Face {
         radii: (f64, f64),
         sweep: f64,
     },
+    /// A full disc across `normal`.
+    Disc {
+        centre: DVec3,
+        normal: DVec3,
+        radius: f64,
+    },
 }
 
 /// A sharp edge, or a part of the border of an open surface.
@@ -148,6 +154,7 @@ impl Face {
                 let slant = axis.length().hypot(radii.1 - radii.0);
                 0.5 * sweep * (radii.0 + radii.1) * slant
             }
+            Face::Disc { radius, .. } => 0.5 * TAU * radius * radius,
         }
     }
 
@@ -196,6 +203,15 @@ impl Face {
                 let out = *start * cos + up.cross(*start) * sin;
                 Some(*base + *axis * h + out * (a + (b - a) * h))
             }
+            Face::Disc {
+                centre,
+                normal,
+                radius,
+            } => {
+                let (sin, cos) = (s * TAU).sin_cos();
+                let u = normal.any_orthonormal_vector();
+                Some(*centre + (u * cos + normal.cross(u) * sin) * (radius * t.sqrt()))
+            }
         }
     }
 
@@ -218,6 +234,15 @@ impl Face {
                 Self::covers(outline, holes, DVec2::new(d.dot(*u), d.dot(*v))).then_some((t, n))
             }
             Face::Round { .. } => self.hit_round(from, along),
+            Face::Disc {
+                centre,
+                normal,
+                radius,
+            } => {
+                let t = (*centre - from).dot(*normal) / along.dot(*normal);
+                let near = (from + along * t).distance(*centre) <= *radius;
+                (t.is_finite() && t > 1e-9 && near).then_some((t, *normal))
+            }
         }
     }
 
@@ -273,6 +298,8 @@ pub struct Sampled {
     pub borders: Vec<Line>,
     /// Whether the points come from rays, which miss some edges: those do not count.
     pub scanned: bool,
+    /// The face each point lies on; empty where not kept.
+    pub faces: Vec<u16>,
     /// Whether each point was made on an edge; empty where none was.
     pub on_edge: Vec<bool>,
 }
@@ -312,6 +339,7 @@ impl Solid {
             edges: self.edges.clone(),
             borders: self.borders.clone(),
             scanned: false,
+            faces: Vec::new(),
             on_edge: Vec::new(),
         }
     }
@@ -352,6 +380,7 @@ impl Solid {
             edges: self.edges.clone(),
             borders: self.borders.clone(),
             scanned: false,
+            faces: Vec::new(),
             on_edge,
         }
     }
@@ -366,7 +395,7 @@ impl Solid {
         seed: u64,
     ) -> Sampled {
         let mut random = Random::new(seed);
-        let mut points = Vec::new();
+        let (mut points, mut faces) = (Vec::new(), Vec::new());
         let reach: f64 = 4.0 * self.radius();
         for towards in views {
             let u = towards.any_orthonormal_vector();
@@ -382,12 +411,14 @@ impl Solid {
                     let nearest = self
                         .faces
                         .iter()
-                        .filter_map(|f| f.hit(from, ray))
+                        .enumerate()
+                        .filter_map(|(i, f)| f.hit(from, ray).map(|(t, n)| (t, n, i as u16)))
                         .min_by(|a, b| a.0.total_cmp(&b.0));
-                    if let Some((t, normal)) = nearest
+                    if let Some((t, normal, face)) = nearest
                         && normal.dot(ray).abs() > 0.17
                     {
                         points.push(from + ray * (t + noise * random.normal()));
+                        faces.push(face);
                     }
                 }
             }
@@ -398,6 +429,7 @@ impl Solid {
             edges: self.edges.clone(),
             borders: self.borders.clone(),
             scanned: true,
+            faces,
             on_edge: Vec::new(),
         }
     }

@@ -78,7 +78,7 @@ pub fn score(sampled: &Sampled, found: &[bool]) -> Score {
     }
 }
 
-/// Share of the edges' length within one spacing of a detected point, where the cloud itself comes within one spacing.
+/// Share of the edges' length within one spacing of a detected point; of a scan, where it has points of two faces that near.
 fn length_recall(sampled: &Sampled, detected: &[DVec3]) -> f64 {
     let s = sampled.spacing;
     let hits = Neighbors::new(detected);
@@ -88,13 +88,18 @@ fn length_recall(sampled: &Sampled, detected: &[DVec3]) -> f64 {
         set.nearest(p, 1, &mut found);
         found.first().is_some_and(|f| f.1 <= s * s)
     };
+    let mut around = Vec::new();
     let (mut length, mut covered) = (0usize, 0usize);
     for edge in &sampled.edges {
         let steps = (edge.length() / (0.1 * s)).ceil().max(1.0) as usize;
         for i in 0..steps {
             let p = edge.at((i as f64 + 0.5) / steps as f64);
-            if sampled.scanned && !near(&all, p) {
-                continue;
+            if sampled.scanned {
+                all.within(p, s, &mut around);
+                let face = |i: u32| sampled.faces.get(i as usize);
+                if around.iter().all(|a| face(a.0) == face(around[0].0)) {
+                    continue;
+                }
             }
             length += 1;
             covered += usize::from(near(&hits, p));

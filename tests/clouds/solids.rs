@@ -80,12 +80,10 @@ fn add_hole(solid: &mut Solid, hole: &Hole) {
             .push(Line::Arc(centre, DVec3::Z, DVec3::X * hole.radius, TAU));
     }
     if hole.blind {
-        solid.faces.push(Face::Round {
-            base,
-            axis: DVec3::Z * 1e-9,
-            start: DVec3::X,
-            radii: (0.0, hole.radius),
-            sweep: TAU,
+        solid.faces.push(Face::Disc {
+            centre: base,
+            normal: DVec3::Z,
+            radius: hole.radius,
         });
     }
 }
@@ -110,6 +108,7 @@ fn centred(mut solid: Solid) -> Solid {
         match face {
             Face::Flat { origin, .. } => *origin += shift,
             Face::Round { base, .. } => *base += shift,
+            Face::Disc { centre, .. } => *centre += shift,
         }
     }
     for line in solid.edges.iter_mut().chain(&mut solid.borders) {
@@ -239,12 +238,10 @@ pub fn cone(radius: f64, height: f64) -> Solid {
                 radii: (radius, 0.0),
                 sweep: TAU,
             },
-            Face::Round {
-                base,
-                axis: DVec3::Z * 1e-9,
-                start: DVec3::X,
-                radii: (0.0, radius),
-                sweep: TAU,
+            Face::Disc {
+                centre: base,
+                normal: DVec3::Z,
+                radius,
             },
         ],
         edges: vec![Line::Arc(base, DVec3::Z, DVec3::X * radius, TAU)],
@@ -262,12 +259,10 @@ pub fn cylinder(radius: f64, height: f64) -> Solid {
         radii: (radius, radius),
         sweep: TAU,
     };
-    solid.faces.push(Face::Round {
-        base: DVec3::Z * (0.5 * height),
-        axis: DVec3::Z * 1e-9,
-        start: DVec3::X,
-        radii: (0.0, radius),
-        sweep: TAU,
+    solid.faces.push(Face::Disc {
+        centre: DVec3::Z * (0.5 * height),
+        normal: DVec3::Z,
+        radius,
     });
     solid.edges.push(Line::Arc(
         DVec3::Z * (0.5 * height),

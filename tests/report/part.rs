@@ -184,6 +184,7 @@ fn edge(index: usize, shape: &Shape, stations: usize, seed: &mut u64) -> EdgeRes
         kind: shape.kind,
         length_mm: shape.length_mm,
         coverage: measured as f64 / stations.len() as f64,
+        mean: None,
         verdict: stations
             .iter()
             .map(|s| s.verdict)

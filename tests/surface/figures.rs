@@ -1,5 +1,8 @@
 //! How far a reconstruction lies from the truth, in units of the spacing.
 
+// The tests and the bench each use a part.
+#![allow(dead_code)]
+
 use acies::points::{Frame, Neighbors, PointCloud};
 use acies::surface::{Reconstruction, Settings, reconstruct};
 use glam::DVec3;

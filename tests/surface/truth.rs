@@ -1,5 +1,8 @@
 //! Bodies whose surface and edges are known exactly, points on them, and how far an answer lies from the truth.
 
+// The tests and the bench each use a part.
+#![allow(dead_code)]
+
 use glam::DVec3;
 
 /// A piece of a body's boundary.
