@@ -26,7 +26,7 @@ pub fn profiler(columns: &[Option<DVec2>]) -> Box<dyn Profiler> {
     assert_eq!(recording.torn_at, None);
     let driver = ALL.iter().find(|d| d.name == "open-profile").unwrap();
     let table = format!(
-        "address = 'replayed'\nserial_number = 'L-7'\nkeepalive_s = {}",
+        "address = 'replayed:7450'\nserial_number = 'L-7'\nkeepalive_s = {}",
         KEEPALIVE_MS / 1000
     );
     let setup = (driver.configure)(table.parse().unwrap()).unwrap();
