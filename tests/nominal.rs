@@ -1,5 +1,8 @@
 //! STEP files read as nominals, against Open CASCADE's answers and against bodies known in closed form.
 
+#[path = "nominal/hostile.rs"]
+mod hostile;
+
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::path::{Path, PathBuf};
 

@@ -30,7 +30,9 @@ pub(super) const BODIES: [&str; 5] = [
 /// Entity type of a wireframe: curves that bound no face.
 const WIREFRAME: &str = "GEOMETRIC_CURVE_SET";
 /// Places of bodies that one file may unfold into.
-const MAX_PLACES: usize = 100_000;
+const MAX_PLACES: usize = 20_000;
+/// Representations that the assemblies of one file may unfold into, those without bodies too.
+const MAX_VISITS: usize = 10 * MAX_PLACES;
 /// Levels of an assembly.
 const MAX_LEVELS: usize = 64;
 
@@ -45,6 +47,12 @@ struct Child {
 struct Assembly<'a> {
     file: &'a Part21,
     children: BTreeMap<u64, Vec<Child>>,
+    /// Bodies and wireframes that each representation holds itself, where that has been asked.
+    held: BTreeMap<u64, Vec<u64>>,
+    /// What representations are read in whose context gives no units.
+    default_units: Units,
+    /// Representations unfolded so far.
+    visits: usize,
     refused: Vec<Refused>,
 }
 
@@ -60,6 +68,9 @@ pub(super) fn placed_bodies(file: &Part21, name: &str) -> Result<Places, Nominal
     let mut assembly = Assembly {
         file,
         children: BTreeMap::new(),
+        held: BTreeMap::new(),
+        default_units: any_units(file),
+        visits: 0,
         refused: Vec::new(),
     };
     assembly.link();
@@ -80,7 +91,7 @@ pub(super) fn placed_bodies(file: &Part21, name: &str) -> Result<Places, Nominal
         let mut found = Vec::new();
         let is_assembly = assembly.children.contains_key(&root);
         if !assembly.walk(root, RigidTransform::IDENTITY, &mut Vec::new(), &mut found) {
-            return Err(NominalError::TooManyFaces {
+            return Err(NominalError::TooManyPlaces {
                 name: name.into(),
                 limit: MAX_PLACES,
             });
@@ -89,7 +100,7 @@ pub(super) fn placed_bodies(file: &Part21, name: &str) -> Result<Places, Nominal
         seen.extend(found.iter().map(|p| p.body));
         out.extend(found);
     }
-    let default = assembly.any_units();
+    let default = assembly.default_units;
     for body in file.all(&BODIES).filter(|b| !seen.contains(b)) {
         out.push(Placed {
             body,
@@ -144,6 +155,18 @@ impl Assembly<'_> {
         }
     }
 
+    /// The bodies and wireframes among the items of a representation.
+    fn held(&mut self, representation: u64) -> &[u64] {
+        if !self.held.contains_key(&representation) {
+            let items = self.items(representation).unwrap_or_default();
+            let is_held =
+                |i: &u64| self.file.is(*i, WIREFRAME) || BODIES.iter().any(|b| self.file.is(*i, b));
+            let held = items.into_iter().filter(is_held).collect();
+            self.held.insert(representation, held);
+        }
+        &self.held[&representation]
+    }
+
     fn context(&self, representation: u64) -> Read<u64> {
         match self.file.part(representation, "REPRESENTATION", 0) {
             Some(part) => part.reference(2),
@@ -161,20 +184,9 @@ impl Assembly<'_> {
                 if !self.refused.contains(&why) {
                     self.refused.push(why);
                 }
-                self.any_units()
+                self.default_units
             }
         }
-    }
-
-    /// Units of the first context that has a length unit; mm and rad in a file without one.
-    fn any_units(&self) -> Units {
-        self.file
-            .all(&["GLOBAL_UNIT_ASSIGNED_CONTEXT"])
-            .find_map(|c| units_of_context(self.file, c).ok())
-            .unwrap_or(Units {
-                length_mm: 1.0,
-                angle_rad: 1.0,
-            })
     }
 
     /// Finds which representation contains which.
@@ -244,11 +256,10 @@ impl Assembly<'_> {
         let transformed = "REPRESENTATION_RELATIONSHIP_WITH_TRANSFORMATION";
         let Some(part) = self.file.part(id, transformed, 4) else {
             // Two representations of one thing: the one with the bodies belongs to the other.
-            let has_bodies = |r: u64| {
-                let items = self.items(r).unwrap_or_default();
-                items
-                    .iter()
-                    .any(|i| BODIES.iter().any(|b| self.file.is(*i, b)))
+            let mut has_bodies = |r: u64| {
+                let file = self.file;
+                let is_body = |i: &u64| !file.is(*i, WIREFRAME);
+                self.held(r).iter().any(is_body)
             };
             let (parent, child) = if has_bodies(first) && !has_bodies(second) {
                 (second, first)
@@ -323,6 +334,10 @@ impl Assembly<'_> {
         trail: &mut Vec<u64>,
         out: &mut Vec<Placed>,
     ) -> bool {
+        self.visits += 1;
+        if self.visits > MAX_VISITS {
+            return false;
+        }
         if trail.contains(&representation) {
             return true;
         }
@@ -333,12 +348,7 @@ impl Assembly<'_> {
             ));
             return true;
         }
-        let bodies: Vec<u64> = self
-            .items(representation)
-            .unwrap_or_default()
-            .into_iter()
-            .filter(|i| self.file.is(*i, WIREFRAME) || BODIES.iter().any(|b| self.file.is(*i, b)))
-            .collect();
+        let bodies = self.held(representation).to_vec();
         if !bodies.is_empty() {
             let units = self.units(representation);
             out.extend(bodies.into_iter().map(|body| Placed {
@@ -361,6 +371,16 @@ impl Assembly<'_> {
         trail.pop();
         true
     }
+}
+
+/// Units of the first context that has a length unit; mm and rad in a file without one.
+fn any_units(file: &Part21) -> Units {
+    file.all(&["GLOBAL_UNIT_ASSIGNED_CONTEXT"])
+        .find_map(|c| units_of_context(file, c).ok())
+        .unwrap_or(Units {
+            length_mm: 1.0,
+            angle_rad: 1.0,
+        })
 }
 
 fn transform_of(frame: &Frame) -> RigidTransform {

@@ -1,6 +1,6 @@
 //! From entities to faces, edges and sharp edges.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use glam::DVec3;
 
@@ -16,6 +16,9 @@ use crate::geometry::{Curve, Frame, RigidTransform, Surface};
 
 /// Faces that one nominal may have.
 const MAX_FACES: usize = 200_000;
+/// Points of the polylines and control points that the faces and curves of one nominal may take together, each time that one
+/// of them is used: a small file could otherwise use a large curve without end.
+const MAX_POINTS: usize = 20_000_000;
 /// Chord of the polylines that bound a face, as a share of the edge's length.
 const CHORD: f64 = 8e-6;
 
@@ -41,18 +44,14 @@ pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
         loose_points: Vec::new(),
         refused,
         refused_faces: 0,
+        points: 0,
     };
     let bodies = places.len();
     for (body, place) in places.iter().enumerate() {
         if let Err(why) = b.body(body, place) {
             b.refused.push(why);
         }
-        if b.faces.len() > MAX_FACES {
-            return Err(NominalError::TooManyFaces {
-                name: name.into(),
-                limit: MAX_FACES,
-            });
-        }
+        b.check_size(name)?;
     }
     if b.faces.is_empty() {
         let none = || refuse(places[0].body, "it has no faces");
@@ -64,6 +63,7 @@ pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
     }
     for place in &wireframes {
         b.wireframe(place);
+        b.check_size(name)?;
     }
     Ok(b.finish(name, bodies))
 }
@@ -123,6 +123,8 @@ struct Builder<'a> {
     loose_points: Vec<DVec3>,
     refused: Vec<Refused>,
     refused_faces: usize,
+    /// Points taken so far.
+    points: usize,
 }
 
 /// What stays the same within one body.
@@ -141,6 +143,28 @@ type ShellFace = (u64, bool);
 type EdgeLoop = Vec<(usize, bool)>;
 
 impl<'a> Builder<'a> {
+    /// Whether no more fits into one nominal.
+    fn is_full(&self) -> bool {
+        self.faces.len() + self.refused_faces > MAX_FACES || self.points > MAX_POINTS
+    }
+
+    fn check_size(&self, name: &str) -> Result<(), NominalError> {
+        let name = || name.into();
+        if self.points > MAX_POINTS {
+            return Err(NominalError::TooDetailed {
+                name: name(),
+                limit: MAX_POINTS,
+            });
+        }
+        if self.is_full() {
+            return Err(NominalError::TooManyFaces {
+                name: name(),
+                limit: MAX_FACES,
+            });
+        }
+        Ok(())
+    }
+
     fn body(&mut self, index: usize, place: &Placed) -> Read<()> {
         let mut cx = BodyCx {
             index,
@@ -152,8 +176,17 @@ impl<'a> Builder<'a> {
             edges: BTreeMap::new(),
         };
         let first = self.faces.len();
+        let mut seen = BTreeSet::new();
         for (face, against) in self.shell_faces(place.body)? {
-            if let Err(why) = self.face(&mut cx, face, against) {
+            if self.is_full() {
+                return Ok(());
+            }
+            let built = if seen.insert(face) {
+                self.face(&mut cx, face, against)
+            } else {
+                Err(refuse(face, "the body lists it before"))
+            };
+            if let Err(why) = built {
                 self.refused_faces += 1;
                 self.refused.push(if why.entity == face {
                     why
@@ -225,6 +258,7 @@ impl<'a> Builder<'a> {
         for bound in r.references(1)? {
             loops.extend(self.bound(cx, bound)?);
         }
+        self.take_points(id, &surface.shape, &loops)?;
         let shape = surface.shape.transformed(&cx.place);
         let (shape, turned) = self.used_part(shape, &loops);
         // Loops run around the face's normal, which may be against the surface's.
@@ -258,6 +292,33 @@ impl<'a> Builder<'a> {
             self.edges[edge].uses.push(Use { face: index, side });
         }
         self.faces.push(face);
+        Ok(())
+    }
+
+    /// Counts the points of a face; refuses loops that use one edge more than twice, which a seam does.
+    fn take_points(&mut self, id: u64, surface: &Surface, loops: &[EdgeLoop]) -> Read<()> {
+        let mut times: BTreeMap<usize, u32> = BTreeMap::new();
+        for (edge, _) in loops.iter().flatten() {
+            let built = &self.edges[*edge];
+            let times = times.entry(*edge).or_default();
+            *times += 1;
+            if *times > 2 {
+                let entity = built.entity;
+                return Err(refuse(
+                    id,
+                    format!("its loops use edge #{entity} more than twice"),
+                ));
+            }
+            self.points += built.points.len();
+        }
+        self.points += match surface {
+            Surface::Nurbs(s) => s.control_points().len(),
+            Surface::Swept(s) => match s.profile() {
+                Curve::Nurbs(c) => c.control_points().len(),
+                _ => 1,
+            },
+            _ => 1,
+        };
         Ok(())
     }
 
@@ -352,6 +413,10 @@ impl<'a> Builder<'a> {
         if let Some(i) = cx.edges.get(&id) {
             return Ok(*i);
         }
+        if self.points > MAX_POINTS {
+            // The whole file is refused after this face.
+            return Err(refuse(id, "no room for its points"));
+        }
         let r = self.file.expect(id, "EDGE_CURVE")?;
         let start = cx.shapes.vertex(r.reference(1)?)?;
         let end = cx.shapes.vertex(r.reference(2)?)?;
@@ -365,6 +430,7 @@ impl<'a> Builder<'a> {
             return Err(refuse(id, "an edge without a finite length"));
         }
         let points = path.polyline(CHORD * path.length_mm());
+        self.points += points.len();
         let index = self.edges.len();
         self.edges.push(BuiltEdge {
             entity: id,
@@ -413,16 +479,18 @@ impl<'a> Builder<'a> {
                 continue;
             }
             match shapes.bounded_curves(item) {
-                Ok(pieces) => self.wires.extend(pieces.into_iter().map(|(curve, range)| {
-                    let curve = curve.transformed(&place.root_from_body);
-                    let length_mm = Path::new(curve.clone(), range).length_mm();
-                    Wire {
-                        entity: item,
-                        curve,
-                        range,
-                        length_mm,
+                Ok(pieces) => {
+                    for (curve, range) in pieces {
+                        let path = Path::new(curve.transformed(&place.root_from_body), range);
+                        self.points += path.node_count();
+                        self.wires.push(Wire {
+                            entity: item,
+                            curve: path.curve().clone(),
+                            range,
+                            length_mm: path.length_mm(),
+                        });
                     }
-                })),
+                }
                 Err(why) => self.refused.push(why),
             }
         }

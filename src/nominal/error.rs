@@ -79,6 +79,26 @@ pub enum NominalError {
         /// The limit.
         limit: usize,
     },
+    /// The assembly unfolds into more parts than we place.
+    #[error(
+        "{name}: the assembly unfolds into more than {limit} occurrences of its parts; export one part at a time"
+    )]
+    TooManyPlaces {
+        /// File.
+        name: String,
+        /// The limit.
+        limit: usize,
+    },
+    /// The faces and curves together need more points than we keep.
+    #[error(
+        "{name}: its faces and curves take more than {limit} points; export the part alone, without copies of its faces"
+    )]
+    TooDetailed {
+        /// File.
+        name: String,
+        /// The limit.
+        limit: usize,
+    },
     /// Bodies were found, but none of their faces can be used.
     #[error("{name}: none of its {faces} faces can be used, the first because #{}: {}; export the part again", first.entity, first.reason)]
     NothingUsable {

@@ -64,6 +64,11 @@ impl Path {
         self.range
     }
 
+    /// Places at which it is evaluated once and for all.
+    pub fn node_count(&self) -> usize {
+        self.nodes.len()
+    }
+
     /// In mm.
     pub fn length_mm(&self) -> f64 {
         self.nodes[self.nodes.len() - 1].s_mm
