@@ -7,7 +7,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Class;
-use super::flanks::{Crease, FAR, Verdict, Workshop, overlooked_turn};
+use super::flanks::{Crease, Verdict, Workshop, overlooked_turn};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
 use crate::points::Neighbors;
@@ -15,7 +15,7 @@ use crate::points::Neighbors;
 /// Points looked at around a candidate, one level after the other as long as the answer is open.
 const LEVELS: [usize; 3] = [40, 100, 220];
 /// Flanks are allowed to depart from a quadric by this many spacings beside the noise.
-const MODEL_ERROR: f64 = 0.025;
+const MODEL_ERROR: f64 = 0.035;
 /// A point is marked when the edge passes within this many spacings.
 pub(super) const THIN: f64 = 0.9;
 /// Share of the neighbours that must see an edge for it to be believed.
