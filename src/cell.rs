@@ -2,7 +2,7 @@
 //!
 //! Hides the order of things. What is announced is in the [`Outcome`]; what goes on meanwhile is told as [`State`]s.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use acies_drivers::capture::Touch;
@@ -79,7 +79,7 @@ pub enum CellError {
     #[error("the part's nominal")]
     Nominal(#[source] Box<NominalError>),
     /// The recipe cannot be read.
-    #[error("{path}: {source}; check that the file may be read")]
+    #[error("{path}: cannot be read: {source}; check the path and its permissions")]
     RecipeFile {
         /// The recipe.
         path: PathBuf,
@@ -88,11 +88,9 @@ pub enum CellError {
         source: std::io::Error,
     },
     /// The recipe has mistakes.
-    #[error("{path}: {mistakes}")]
+    #[error("{mistakes}")]
     Recipe {
-        /// The recipe.
-        path: PathBuf,
-        /// All of them, a line each.
+        /// All of them, a line each, which begins with the file.
         mistakes: String,
     },
     /// A device would not open.
@@ -134,22 +132,24 @@ pub enum CellError {
     Scan(#[from] ScanError),
 }
 
-/// Reads a recipe, or the default one where the cell has none.
+/// The recipe in a file, or the default one where there is no file.
 ///
 /// # Errors
 /// [`CellError::RecipeFile`] and [`CellError::Recipe`].
-pub fn read_recipe(path: Option<&PathBuf>) -> Result<Recipe, CellError> {
+pub fn read_recipe(path: Option<&Path>) -> Result<Recipe, CellError> {
     let Some(path) = path else {
         return Ok(Recipe::default());
     };
     let text = std::fs::read_to_string(path).map_err(|source| CellError::RecipeFile {
-        path: path.clone(),
+        path: path.to_owned(),
         source,
     })?;
     Recipe::parse(&text).map_err(|mistakes| {
-        let lines: Vec<String> = mistakes.iter().map(ToString::to_string).collect();
+        let lines: Vec<String> = mistakes
+            .iter()
+            .map(|mistake| format!("{}: {mistake}", path.display()))
+            .collect();
         CellError::Recipe {
-            path: path.clone(),
             mistakes: lines.join("\n"),
         }
     })
@@ -167,7 +167,7 @@ pub fn run(
 ) -> Result<Outcome, CellError> {
     let nominal =
         Nominal::read(&cell.nominal).map_err(|error| CellError::Nominal(Box::new(error)))?;
-    let recipe = read_recipe(cell.recipe.as_ref())?;
+    let recipe = read_recipe(cell.recipe.as_deref())?;
     let profilers = open_profilers(cell, links, watch)?;
     let (probes, touches) = touch_all(cell, links, watch)?;
     let began = Instant::now();

@@ -173,18 +173,22 @@ impl Keys {
 
     /// Three finite numbers under `key`.
     pub fn vector(&mut self, key: &'static str) -> Option<[f64; 3]> {
+        self.read(key, "three numbers, as in [0.0, 0.0, -50.0]", numbers)
+    }
+
+    /// What `read` makes of the value under `key`; a value of which it makes nothing is wrong.
+    pub fn read<T>(
+        &mut self,
+        key: &'static str,
+        expected: &str,
+        read: impl FnOnce(&Value) -> Option<T>,
+    ) -> Option<T> {
         let value = self.value(key)?;
-        let numbers: Option<Vec<f64>> = value
-            .as_array()
-            .map(|array| array.iter().filter_map(number).collect());
-        let vector = numbers
-            .and_then(|numbers| <[f64; 3]>::try_from(numbers).ok())
-            .filter(|v| v.iter().all(|x| x.is_finite()))
-            .filter(|_| value.as_array().is_some_and(|array| array.len() == 3));
-        if vector.is_none() {
-            self.wrong(key, shown(&value), "three numbers, as in [0.0, 0.0, -50.0]");
+        let found = read(&value);
+        if found.is_none() {
+            self.wrong(key, shown(&value), expected);
         }
-        vector
+        found
     }
 
     /// The link under `port`, `usb_serial`, `usb_id` or `address`, with `baud`.
@@ -264,12 +268,20 @@ impl Keys {
     }
 }
 
-fn number(value: &Value) -> Option<f64> {
-    match value {
-        Value::Float(number) => Some(*number),
-        Value::Integer(number) => Some(*number as f64),
-        _ => None,
-    }
+/// The finite number that `value` is, written whole or not.
+pub fn number(value: &Value) -> Option<f64> {
+    let number = match value {
+        Value::Float(number) => *number,
+        Value::Integer(number) => *number as f64,
+        _ => return None,
+    };
+    number.is_finite().then_some(number)
+}
+
+/// The `N` finite numbers that `value` is an array of.
+pub fn numbers<const N: usize>(value: &Value) -> Option<[f64; N]> {
+    let numbers: Option<Vec<f64>> = value.as_array()?.iter().map(number).collect();
+    numbers?.try_into().ok()
 }
 
 /// A value as written, shortened.

@@ -5,10 +5,11 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, SystemTime};
 
-use anyhow::{Context, anyhow};
+use anyhow::anyhow;
 use indicatif::ProgressBar;
 
 use super::{Failure, Status, print_line, status_of};
+use crate::cell::{CellError, read_recipe};
 use crate::inspect::{self, Inspection, Recipe, Request, Start};
 use crate::nominal::{Nominal, NominalError};
 use crate::points::{self, PointsError, Read, Unit};
@@ -57,7 +58,10 @@ impl Inspect {
     /// # Errors
     /// Bad input where scan, model or recipe cannot be understood; input or output where a file cannot be read or written.
     pub fn run(self) -> Result<Status, Failure> {
-        let recipe = self.read_recipe()?;
+        let recipe = read_recipe(self.recipe.as_deref()).map_err(|error| match error {
+            CellError::RecipeFile { .. } => Failure::Io(error.into()),
+            _ => Failure::BadInput(error.into()),
+        })?;
         let nominal = Nominal::read(&self.nominal).map_err(|error| match error {
             NominalError::Io { .. } => Failure::Io(error.into()),
             _ => Failure::BadInput(error.into()),
@@ -88,22 +92,6 @@ impl Inspect {
             print_line(&print_table(&report, std::io::stdout().is_terminal()))?;
         }
         Ok(status_of(&report))
-    }
-
-    fn read_recipe(&self) -> Result<Recipe, Failure> {
-        let Some(path) = &self.recipe else {
-            return Ok(Recipe::default());
-        };
-        let text = std::fs::read_to_string(path)
-            .with_context(|| format!("{}: cannot be read", path.display()))
-            .map_err(Failure::Io)?;
-        Recipe::parse(&text).map_err(|mistakes| {
-            let lines: Vec<String> = mistakes
-                .iter()
-                .map(|mistake| format!("{}: {mistake}", path.display()))
-                .collect();
-            Failure::BadInput(anyhow!("{}", lines.join("\n")))
-        })
     }
 
     fn inspect(&self, scan: &Read, nominal: &Nominal, recipe: &Recipe) -> Inspection {

@@ -8,17 +8,22 @@
 //! u_calibration_mm = 0.002          # standard uncertainty of a flank's place from the sensor's calibration
 //! u_calibration_rad = 0.0           # and of the included angle
 //!
-//! [limits]                          # of every edge without its own; without limits a value is not evaluated
+//! [limits]                          # of every edge; without limits a value is not evaluated
 //! d_mm = [-0.1, 0.1]                # of d1 and d2; d1_mm and d2_mm name one
 //! included_angle_deg = [-0.5, 0.5]  # of the deviation from the nominal included angle
 //!
 //! [[edge]]
 //! entity = 123                      # the STEP entity of the edge, or: id = "e4"
 //! name = "sealing lip"              # optional
-//! d_mm = [-0.05, 0.02]
+//! d_mm = [-0.05, 0.02]              # what is not given here holds as in [limits]
+//!
+//! [[edge]]
+//! id = "e7"
+//! judged = false                    # nothing of it is evaluated; the default is true
 //! ```
 
 use acies_drivers::device::Mistake;
+use acies_drivers::settings::{Keys, number, numbers};
 use toml::Value;
 
 /// What an inspection is asked to judge.
@@ -26,9 +31,9 @@ use toml::Value;
 pub struct Recipe {
     /// How the uncertainty counts.
     pub rule: Rule,
-    /// Limits of every edge that has none of its own.
+    /// Limits of every edge for which `edges` says nothing else.
     pub limits: Limits,
-    /// Edges with a name or limits of their own.
+    /// Edges with a name or limits of their own, or out of judgement.
     pub edges: Vec<EdgeRecipe>,
     /// STEP entities of the faces that hold the alignment; empty = all faces.
     pub datum_faces: Vec<u64>,
@@ -66,7 +71,7 @@ pub enum Rule {
     GuardBand(f64),
 }
 
-/// Lower and upper limits of one edge; `None` = not evaluated.
+/// Lower and upper limits that hold for one edge; `None` = not evaluated.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Limits {
     /// Of d1 and d2, mm.
@@ -79,6 +84,14 @@ impl Limits {
     /// Whether nothing is evaluated.
     pub fn is_empty(&self) -> bool {
         *self == Self::default()
+    }
+
+    /// These, and those of `general` where there are none.
+    fn or(self, general: Self) -> Self {
+        Self {
+            d_mm: [0, 1].map(|i| self.d_mm[i].or(general.d_mm[i])),
+            angle_rad: self.angle_rad.or(general.angle_rad),
+        }
     }
 }
 
@@ -98,7 +111,7 @@ pub struct EdgeRecipe {
     pub key: EdgeKey,
     /// The name it gets in the report.
     pub name: Option<String>,
-    /// Its limits; those not given are not evaluated.
+    /// All that hold for it: its own, and those of the recipe for what it does not give; none where it is not judged.
     pub limits: Limits,
 }
 
@@ -109,25 +122,16 @@ impl Recipe {
     /// All mistakes at once: text that is no TOML, unknown keys, wrong types, limits upside down.
     pub fn parse(text: &str) -> Result<Self, Vec<Mistake>> {
         let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-            let place = error.span().map_or(1, |span| line_of(text, span.start));
-            vec![mistake(
-                "recipe",
-                &format!("line {place}: {}", error.message()),
-                "TOML",
-            )]
+            let line = error.span().map_or(1, |span| line_of(text, span.start));
+            vec![Mistake {
+                key: "recipe".to_owned(),
+                found: format!("line {line}: {}", error.message()),
+                expected: "TOML".to_owned(),
+            }]
         })?;
-        let mut reader = Reader {
-            table,
-            prefix: String::new(),
-            mistakes: Vec::new(),
-        };
-        let recipe = reader.recipe();
-        reader.leftovers(RECIPE_KEYS);
-        if reader.mistakes.is_empty() {
-            Ok(recipe)
-        } else {
-            Err(reader.mistakes)
-        }
+        let mut keys = Keys::new(table);
+        let recipe = recipe(&mut keys);
+        keys.finish().map(|()| recipe)
     }
 
     /// What the recipe says of the edge with this id and entity.
@@ -145,230 +149,135 @@ impl Recipe {
     }
 }
 
-const RECIPE_KEYS: &str = "rule, limits, edge, datum_faces, minimum_coverage, station_step_mm, u_calibration_mm or u_calibration_rad";
-const LIMIT_KEYS: &str = "d_mm, d1_mm, d2_mm or included_angle_deg";
-
-fn mistake(key: &str, found: &str, expected: &str) -> Mistake {
-    Mistake {
-        key: key.to_string(),
-        found: found.to_string(),
-        expected: expected.to_string(),
-    }
-}
-
 fn line_of(text: &str, byte: usize) -> usize {
     1 + text.bytes().take(byte).filter(|b| *b == b'\n').count()
 }
 
-/// Takes keys out of a table and notes what is wrong.
-struct Reader {
-    table: toml::Table,
-    prefix: String,
-    mistakes: Vec<Mistake>,
-}
-
-impl Reader {
-    fn recipe(&mut self) -> Recipe {
-        let default = Recipe::default();
-        let limits = self.inner("limits", "a table");
-        let edges = self.edges();
-        Recipe {
-            rule: self.rule(),
-            limits: limits.map_or(Limits::default(), |mut inner| {
-                let limits = inner.limits();
-                inner.leftovers(LIMIT_KEYS);
-                self.mistakes.append(&mut inner.mistakes);
-                limits
-            }),
-            edges,
-            datum_faces: self.entities("datum_faces"),
-            minimum_coverage: self
-                .number("minimum_coverage", 0.0, 1.0)
-                .unwrap_or(default.minimum_coverage),
-            station_step_mm: self.number("station_step_mm", 1e-3, 1e4),
-            u_calibration_mm: self.number("u_calibration_mm", 0.0, 10.0).unwrap_or(0.0),
-            u_calibration_rad: self.number("u_calibration_rad", 0.0, 1.0).unwrap_or(0.0),
-        }
+fn recipe(keys: &mut Keys) -> Recipe {
+    let default = Recipe::default();
+    let mut limits = Limits::default();
+    if let Some(table) = keys.table("limits") {
+        let mut inner = Keys::new(table);
+        limits = own_limits(&mut inner);
+        keys.adopt("limits", inner);
     }
-
-    fn wrong(&mut self, key: &str, found: &str, expected: &str) {
-        let key = format!("{}{key}", self.prefix);
-        self.mistakes.push(mistake(&key, found, expected));
-    }
-
-    fn wrong_value(&mut self, key: &str, found: &Value, expected: &str) {
-        let shown: String = found.to_string().chars().take(60).collect();
-        self.wrong(key, &format!("{} {shown}", found.type_str()), expected);
-    }
-
-    fn leftovers(&mut self, allowed: &str) {
-        let left: Vec<String> = self.table.keys().cloned().collect();
-        for key in left {
-            self.wrong(&key, "an unknown key", allowed);
-        }
-    }
-
-    fn inner(&mut self, key: &str, expected: &str) -> Option<Reader> {
-        match self.table.remove(key)? {
-            Value::Table(table) => Some(Reader {
-                table,
-                prefix: format!("{}{key}.", self.prefix),
-                mistakes: Vec::new(),
-            }),
-            other => {
-                self.wrong_value(key, &other, expected);
-                None
-            }
-        }
-    }
-
-    fn rule(&mut self) -> Rule {
-        const EXPECTED: &str = "\"simple\" or { guard_band = k } with k from 0 to 10";
-        match self.table.remove("rule") {
-            None => return Rule::Simple,
-            Some(Value::String(text)) if text == "simple" => return Rule::Simple,
-            Some(Value::Table(table)) if table.len() == 1 => {
-                let k = table.get("guard_band").and_then(as_number);
-                match k {
-                    Some(k) if (0.0..=10.0).contains(&k) => return Rule::GuardBand(k),
-                    _ => self.wrong_value("rule", &Value::Table(table), EXPECTED),
-                }
-            }
-            Some(other) => self.wrong_value("rule", &other, EXPECTED),
-        }
-        Rule::Simple
-    }
-
-    fn limits(&mut self) -> Limits {
-        let both = self.pair("d_mm");
-        let d1 = self.pair("d1_mm").or(both);
-        let d2 = self.pair("d2_mm").or(both);
-        let angle = self.pair("included_angle_deg");
-        Limits {
-            d_mm: [d1, d2],
-            angle_rad: angle.map(|pair| pair.map(f64::to_radians)),
-        }
-    }
-
-    fn edges(&mut self) -> Vec<EdgeRecipe> {
-        let items = match self.table.remove("edge") {
-            None => return Vec::new(),
-            Some(Value::Array(items)) => items,
-            Some(other) => {
-                self.wrong_value("edge", &other, "tables, each under [[edge]]");
-                return Vec::new();
-            }
-        };
-        let mut edges: Vec<EdgeRecipe> = Vec::new();
-        for (k, item) in items.into_iter().enumerate() {
-            let Value::Table(table) = item else {
-                self.wrong_value(&format!("edge[{k}]"), &item, "a table under [[edge]]");
-                continue;
-            };
-            let mut inner = Reader {
-                table,
-                prefix: format!("{}edge[{k}].", self.prefix),
-                mistakes: Vec::new(),
-            };
-            let edge = inner.edge();
-            inner.leftovers(&format!("entity, id, name, {LIMIT_KEYS}"));
-            self.mistakes.append(&mut inner.mistakes);
-            let Some(edge) = edge else { continue };
-            if edges.iter().any(|e| e.key == edge.key) {
-                self.wrong(
-                    &format!("edge[{k}]"),
-                    "an edge that has an entry above",
-                    "one entry an edge",
-                );
-            }
-            edges.push(edge);
-        }
-        edges
-    }
-
-    fn edge(&mut self) -> Option<EdgeRecipe> {
-        let entity = self.table.remove("entity");
-        let id = self.text("id");
-        let name = self.text("name");
-        let limits = self.limits();
-        let key = match (entity, id) {
-            (Some(Value::Integer(n)), None) if n > 0 => EdgeKey::Entity(n as u64),
-            (Some(other), None) => {
-                self.wrong_value("entity", &other, "the number of a STEP entity");
-                return None;
-            }
-            (None, Some(id)) => EdgeKey::Id(id),
-            (None, None) => {
-                self.wrong("entity", "nothing", "entity or id, to say which edge");
-                return None;
-            }
-            (Some(_), Some(_)) => {
-                self.wrong("entity", "entity and id", "one of the two");
-                return None;
-            }
-        };
-        Some(EdgeRecipe { key, name, limits })
-    }
-
-    fn text(&mut self, key: &str) -> Option<String> {
-        match self.table.remove(key)? {
-            Value::String(text) => Some(text),
-            other => {
-                self.wrong_value(key, &other, "a text");
-                None
-            }
-        }
-    }
-
-    fn number(&mut self, key: &str, low: f64, high: f64) -> Option<f64> {
-        let value = self.table.remove(key)?;
-        let number = as_number(&value).filter(|n| (low..=high).contains(n));
-        if number.is_none() {
-            self.wrong_value(key, &value, &format!("a number from {low} to {high}"));
-        }
-        number
-    }
-
-    fn pair(&mut self, key: &str) -> Option<[f64; 2]> {
-        let value = self.table.remove(key)?;
-        let numbers: Option<Vec<f64>> = value
-            .as_array()
-            .and_then(|items| items.iter().map(as_number).collect());
-        match numbers.as_deref() {
-            Some([low, high]) if low <= high => Some([*low, *high]),
-            _ => {
-                self.wrong_value(key, &value, "two numbers, the lower limit then the upper");
-                None
-            }
-        }
-    }
-
-    fn entities(&mut self, key: &str) -> Vec<u64> {
-        let Some(value) = self.table.remove(key) else {
-            return Vec::new();
-        };
-        let numbers: Option<Vec<u64>> = value.as_array().and_then(|items| {
-            let entity = |item: &Value| item.as_integer().and_then(|n| u64::try_from(n).ok());
-            items.iter().map(entity).collect()
-        });
-        numbers.unwrap_or_else(|| {
-            self.wrong_value(key, &value, "numbers of STEP entities");
-            Vec::new()
-        })
+    Recipe {
+        rule: rule(keys).unwrap_or(default.rule),
+        limits,
+        edges: edges(keys, limits),
+        datum_faces: entities(keys, "datum_faces").unwrap_or_default(),
+        minimum_coverage: keys
+            .number("minimum_coverage", 0.0..=1.0)
+            .unwrap_or(default.minimum_coverage),
+        station_step_mm: keys.number("station_step_mm", 1e-3..=1e4),
+        u_calibration_mm: keys
+            .number("u_calibration_mm", 0.0..=10.0)
+            .unwrap_or(default.u_calibration_mm),
+        u_calibration_rad: keys
+            .number("u_calibration_rad", 0.0..=1.0)
+            .unwrap_or(default.u_calibration_rad),
     }
 }
 
-fn as_number(value: &Value) -> Option<f64> {
-    let number = match value {
-        Value::Float(x) => *x,
-        Value::Integer(n) => *n as f64,
-        _ => return None,
+fn rule(keys: &mut Keys) -> Option<Rule> {
+    let expected = "\"simple\" or { guard_band = k } with k of 0 to 10";
+    keys.read("rule", expected, |value| match value {
+        Value::String(word) if word == "simple" => Some(Rule::Simple),
+        Value::Table(table) if table.len() == 1 => {
+            let k = table.get("guard_band").and_then(number);
+            k.filter(|k| (0.0..=10.0).contains(k)).map(Rule::GuardBand)
+        }
+        _ => None,
+    })
+}
+
+fn entities(keys: &mut Keys, key: &'static str) -> Option<Vec<u64>> {
+    keys.read(key, "numbers of STEP entities", |value| {
+        value.as_array()?.iter().map(entity).collect()
+    })
+}
+
+/// STEP counts its entities from 1.
+fn entity(value: &Value) -> Option<u64> {
+    let entity = u64::try_from(value.as_integer()?).ok()?;
+    (entity > 0).then_some(entity)
+}
+
+/// The limits that the table itself gives.
+fn own_limits(keys: &mut Keys) -> Limits {
+    let both = pair(keys, "d_mm");
+    let d1 = pair(keys, "d1_mm").or(both);
+    let d2 = pair(keys, "d2_mm").or(both);
+    let angle = pair(keys, "included_angle_deg");
+    Limits {
+        d_mm: [d1, d2],
+        angle_rad: angle.map(|pair| pair.map(f64::to_radians)),
+    }
+}
+
+fn pair(keys: &mut Keys, key: &'static str) -> Option<[f64; 2]> {
+    let expected = "two numbers, the lower limit then the upper";
+    keys.read(key, expected, |value| {
+        numbers(value).filter(|[lower, upper]| lower <= upper)
+    })
+}
+
+fn edges(keys: &mut Keys, general: Limits) -> Vec<EdgeRecipe> {
+    let mut edges: Vec<EdgeRecipe> = Vec::new();
+    for (k, table) in keys.tables("edge").into_iter().enumerate() {
+        let place = format!("edge[{k}]");
+        let mut inner = Keys::new(table);
+        let edge = edge(&mut inner, general);
+        keys.adopt(&place, inner);
+        let Some(edge) = edge else { continue };
+        if edges.iter().any(|above| above.key == edge.key) {
+            keys.wrong(
+                &place,
+                "an edge that has an entry above",
+                "one entry an edge",
+            );
+        }
+        edges.push(edge);
+    }
+    edges
+}
+
+fn edge(keys: &mut Keys, general: Limits) -> Option<EdgeRecipe> {
+    let key = edge_key(keys);
+    let name = keys.text("name");
+    let judged = keys.flag("judged").unwrap_or(true);
+    let own = own_limits(keys);
+    if !judged && !own.is_empty() {
+        keys.wrong("judged", "false beside limits", "one of the two");
+    }
+    let limits = if judged {
+        own.or(general)
+    } else {
+        Limits::default()
     };
-    number.is_finite().then_some(number)
+    Some(EdgeRecipe {
+        key: key?,
+        name,
+        limits,
+    })
+}
+
+fn edge_key(keys: &mut Keys) -> Option<EdgeKey> {
+    let given = (keys.contains("entity"), keys.contains("id"));
+    let by_entity = keys.read("entity", "the number of a STEP entity", entity);
+    let by_id = keys.text("id");
+    match given {
+        (true, true) => keys.wrong("entity", "entity and id", "one of the two"),
+        (false, false) => keys.wrong("entity", "nothing", "entity or id, to say which edge"),
+        _ => {}
+    }
+    by_entity.map(EdgeKey::Entity).or(by_id.map(EdgeKey::Id))
 }
 
 #[cfg(test)]
 mod tests {
+    use std::f64::consts::PI;
+
     use super::*;
 
     #[test]
@@ -387,34 +296,59 @@ mod tests {
         assert_eq!(recipe.limits("e9", 5).d_mm, [Some([-0.1, 0.1]); 2]);
         let own = recipe.limits("e9", 123);
         assert_eq!(own.d_mm, [Some([-0.05, 0.02]); 2]);
-        assert_eq!(own.angle_rad, None);
+        assert_eq!(own.angle_rad, recipe.limits.angle_rad);
+        assert!(own.angle_rad.is_some());
+        assert!(recipe.limits("e7", 5).is_empty());
+    }
+
+    #[test]
+    fn an_edge_keeps_the_general_limits_for_what_it_does_not_give() {
+        let text = "[limits]\nd_mm = [-0.1, 0.1]\n\
+                    [[edge]]\nid = \"e1\"\nname = \"lip\"\n\
+                    [[edge]]\nid = \"e2\"\nd2_mm = [0, 1]\n\
+                    [[edge]]\nid = \"e3\"\nincluded_angle_deg = [-180.0, 180.0]\njudged = true\n\
+                    [[edge]]\nid = \"e4\"\njudged = false\n";
+        let recipe = Recipe::parse(text).expect("a recipe");
+        let general = Some([-0.1, 0.1]);
+        let of = |id| recipe.limits(id, 0);
+        assert_eq!(of("e1"), recipe.limits);
+        assert_eq!(of("e2").d_mm, [general, Some([0.0, 1.0])]);
+        assert_eq!(of("e3").d_mm, [general; 2]);
+        assert_eq!(of("e3").angle_rad, Some([-PI, PI]));
+        assert_eq!(of("e4"), Limits::default());
+        assert_eq!(of("e5"), recipe.limits);
     }
 
     #[test]
     fn all_mistakes_come_at_once() {
         let text = "rule = \"strict\"\nminimum_coverage = 2\ncolour = 1\ndatum_faces = [\"a\"]\n\
                     [limits]\nd_mm = [0.1, -0.1]\nwidth = 3\n\
-                    [[edge]]\nname = 3\n[[edge]]\nid = \"e1\"\n[[edge]]\nid = \"e1\"\nd1_mm = nan\n";
-        let mistakes = Recipe::parse(text).expect_err("nine mistakes");
+                    [[edge]]\nname = 3\n[[edge]]\nid = \"e1\"\n[[edge]]\nid = \"e1\"\nd1_mm = nan\n\
+                    [[edge]]\nentity = 0\n[[edge]]\nentity = 5\nid = \"e5\"\n\
+                    [[edge]]\nid = \"e6\"\njudged = false\nd_mm = [0, 1]\n";
+        let mistakes = Recipe::parse(text).expect_err("thirteen mistakes");
         let lines: Vec<String> = mistakes.iter().map(Mistake::to_string).collect();
         for expected in [
-            "rule: string \"strict\", expected \"simple\" or { guard_band = k } with k from 0 to 10",
-            "minimum_coverage: integer 2, expected a number from 0 to 1",
-            "colour: an unknown key, expected rule, limits",
-            "datum_faces: array [\"a\"], expected numbers of STEP entities",
-            "limits.d_mm: array [0.1, -0.1], expected two numbers, the lower limit then the upper",
-            "limits.width: an unknown key, expected d_mm",
-            "edge[0].name: integer 3, expected a text",
+            "rule: \"strict\", expected \"simple\" or { guard_band = k } with k of 0 to 10",
+            "minimum_coverage: 2, expected a number of 0 to 1",
+            "colour: an unknown key, expected one of limits, rule, edge",
+            "datum_faces: [\"a\"], expected numbers of STEP entities",
+            "limits.d_mm: [0.1, -0.1], expected two numbers, the lower limit then the upper",
+            "limits.width: an unknown key, expected one of d_mm",
+            "edge[0].name: 3, expected a text",
             "edge[0].entity: nothing, expected entity or id, to say which edge",
-            "edge[2].d1_mm: float nan, expected two numbers",
+            "edge[2].d1_mm: nan, expected two numbers",
             "edge[2]: an edge that has an entry above, expected one entry an edge",
+            "edge[3].entity: 0, expected the number of a STEP entity",
+            "edge[4].entity: entity and id, expected one of the two",
+            "edge[5].judged: false beside limits, expected one of the two",
         ] {
             assert!(
                 lines.iter().any(|line| line.starts_with(expected)),
                 "{expected}\nnot in {lines:#?}"
             );
         }
-        assert_eq!(mistakes.len(), 10, "{lines:#?}");
+        assert_eq!(mistakes.len(), 13, "{lines:#?}");
     }
 
     #[test]

@@ -94,7 +94,7 @@ pub struct Recipe {
     pub rule: Rule,
     /// Half the width of the uncertainty zone in standard uncertainties; null for the simple rule.
     pub guard_band_k: Option<f64>,
-    /// Limits of every edge that has none of its own.
+    /// Limits of every edge for which the recipe says nothing else.
     pub limits: Limits,
     /// Share of an edge that must be measured for it to be decidable, 0 to 1.
     pub minimum_coverage: Option<f64>,
