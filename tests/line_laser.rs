@@ -96,6 +96,10 @@ fn check_nothing_lost(scan: &Scan, columns: &[Option<DVec2>]) {
 /// Half a count in x and in z, and the rounding of the transforms.
 const QUANTISATION_MM: f64 = 0.5 * std::f64::consts::SQRT_2 * device::COUNT_MM + 1e-10;
 
+#[allow(
+    clippy::print_stdout,
+    reason = "the figures are to be seen with --nocapture"
+)]
 fn print(name: &str, cloud: &PointCloud, analysis: &ProfileAnalysis) {
     println!(
         "{name}: {} points, spacing {:.4} mm, noise {:.2} um, {} outliers, {} breaks, {} corners",

@@ -210,7 +210,7 @@ impl Workshop {
     }
 
     /// Gives every point to its nearest plane and fits the planes anew, a few times.
-    fn assign(&mut self, planes: &mut Vec<Plane>, variance: f64) {
+    fn assign(&mut self, planes: &mut [Plane], variance: f64) {
         let n = self.points.len();
         for round in 0..3 {
             let cap = variance * [25.0, 16.0, 9.0][round];

@@ -194,8 +194,9 @@ fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; 
         }
         for i in k + 1..N {
             let f = a[k][i] / pivot;
-            for j in i..N {
-                a[i][j] -= f * a[k][j];
+            let pivot_row = a[k];
+            for (value, above) in a[i].iter_mut().zip(&pivot_row).skip(i) {
+                *value -= f * above;
             }
             b[i] -= f * b[k];
         }

@@ -573,7 +573,7 @@ impl<'a> Arrangement<'a> {
             normals = (na, nb);
             let moved = next.distance(x);
             x = next;
-            if !(x.length() < self.reach_mm) {
+            if x.length().is_nan() || x.length() >= self.reach_mm {
                 return None;
             }
             if moved < 1e-3 * self.scale.floor_mm() {
@@ -600,7 +600,7 @@ impl<'a> Arrangement<'a> {
             let next = rows.inverse() * DVec3::from_array(right);
             let moved = next.distance(x);
             x = next;
-            if !(x.length() < self.reach_mm) {
+            if x.length().is_nan() || x.length() >= self.reach_mm {
                 return None;
             }
             if moved < 1e-3 * self.scale.floor_mm() {

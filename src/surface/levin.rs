@@ -118,7 +118,7 @@ pub(crate) fn reference_plane(
         let step = solve_symmetric(hessian, gradient)?;
         offset -= step[0];
         normal = (normal - u * step[1] - v * step[2]).normalize();
-        if !(offset.abs() <= 3.0 * h_mm) {
+        if offset.is_nan() || offset.abs() > 3.0 * h_mm {
             return None;
         }
     }
@@ -132,7 +132,8 @@ fn solve_symmetric(m: [[f64; 3]; 3], right: [f64; 3]) -> Option<[f64; 3]> {
         [m[0][2], m[1][2], m[2][2]],
     ]);
     let size = m[0][0] * m[1][1] * m[2][2];
-    if !(matrix.determinant() > 1e-9 * size) {
+    let determinant = matrix.determinant();
+    if determinant.is_nan() || determinant <= 1e-9 * size {
         return None;
     }
     Some((matrix.inverse() * DVec3::from_array(right)).to_array())

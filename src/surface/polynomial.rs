@@ -129,11 +129,13 @@ impl Equations {
             self.weights_squared += weight * weight;
             self.count += 1;
         }
-        for i in 0..T {
-            for j in 0..T {
-                self.matrix[i][j] += matrix[i][j];
+        for (sums, row) in self.matrix.iter_mut().zip(&matrix) {
+            for (sum, value) in sums.iter_mut().zip(row) {
+                *sum += value;
             }
-            self.right[i] += right[i];
+        }
+        for (sum, value) in self.right.iter_mut().zip(&right) {
+            *sum += value;
         }
     }
 
@@ -205,8 +207,8 @@ impl Equations {
         for i in 0..terms {
             for j in 0..=i {
                 let mut sum = self.matrix[i][j];
-                for k in 0..j {
-                    sum -= lower[i][k] * lower[j][k];
+                for (a, b) in lower[i].iter().zip(&lower[j]).take(j) {
+                    sum -= a * b;
                 }
                 if i == j {
                     // A column that others explain to one part in 10^7 carries nothing but rounding and noise.
@@ -359,7 +361,8 @@ impl Polynomial {
             let dy = (a[0] * fy - a[1] * fx) / determinant;
             x -= dx;
             y -= dy;
-            if !(x * x + y * y <= reach_mm * reach_mm) {
+            let square = x * x + y * y;
+            if square.is_nan() || square > reach_mm * reach_mm {
                 return None;
             }
             if dx * dx + dy * dy < 1e-18 * reach_mm * reach_mm {

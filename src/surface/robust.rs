@@ -46,7 +46,8 @@ pub(crate) fn robust_normal(points: &[DVec3], scale: &Scale) -> Option<(DVec3, f
         let [a, b, c] = draw(&mut dice, n.min(DRAWN_FROM)).map(|i| points[i]);
         let cross = (b - a).cross(c - a);
         let size = cross.length();
-        if !(size > 0.2 * (b - a).length() * (c - a).length())
+        if size.is_nan()
+            || size <= 0.2 * (b - a).length() * (c - a).length()
             || size < 0.1 * scale.spacing_mm * scale.spacing_mm
         {
             continue;
@@ -118,7 +119,8 @@ fn noise_of_plane(cloud: &PointCloud, neighbors: &Neighbors, p: DVec3) -> Option
     for _ in 0..TRIALS {
         let [a, b, c] = draw(&mut dice, points.len()).map(|i| points[i]);
         let cross = (b - a).cross(c - a);
-        if !(cross.length() > 0.2 * (b - a).length() * (c - a).length()) {
+        let size = cross.length();
+        if size.is_nan() || size <= 0.2 * (b - a).length() * (c - a).length() {
             continue;
         }
         let normal = cross.normalize();
