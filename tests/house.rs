@@ -236,7 +236,14 @@ fn nothing_is_ignored_and_nobody_sleeps_in_tests() {
     // Put together so that this file does not find itself.
     let ignored = ["#[", "ignore"].concat();
     let unfinished = [["todo", "!("].concat(), ["unimplemented", "!("].concat()];
+    let sleeps = ["thread", "::sleep"].concat();
     for (file, text) in all_rust_files() {
+        let test = file.components().any(|part| part.as_os_str() == "tests");
+        assert!(
+            !(test && text.contains(&sleeps)),
+            "{}: wait for what is waited for, not for a while",
+            file.display()
+        );
         assert!(
             !text.contains(&ignored),
             "{}: a test that does not run proves nothing",
