@@ -155,6 +155,16 @@ pub fn read_recipe(path: Option<&Path>) -> Result<Recipe, CellError> {
     })
 }
 
+/// The part's nominal and the recipe it is judged by.
+///
+/// # Errors
+/// [`CellError::Nominal`], [`CellError::RecipeFile`] and [`CellError::Recipe`].
+pub fn read_part(cell: &Cell) -> Result<(Nominal, Recipe), CellError> {
+    let nominal =
+        Nominal::read(&cell.nominal).map_err(|error| CellError::Nominal(Box::new(error)))?;
+    Ok((nominal, read_recipe(cell.recipe.as_deref())?))
+}
+
 /// Runs one inspection of the part that lies in the cell.
 ///
 /// # Errors
@@ -165,9 +175,7 @@ pub fn run(
     links: &dyn Links,
     watch: &mut dyn FnMut(State),
 ) -> Result<Outcome, CellError> {
-    let nominal =
-        Nominal::read(&cell.nominal).map_err(|error| CellError::Nominal(Box::new(error)))?;
-    let recipe = read_recipe(cell.recipe.as_deref())?;
+    let (nominal, recipe) = read_part(cell)?;
     let profilers = open_profilers(cell, links, watch)?;
     let (probes, touches) = touch_all(cell, links, watch)?;
     let began = Instant::now();

@@ -66,5 +66,12 @@ fn report(failure: &Failure) {
     | Failure::BadInput(error)
     | Failure::Internal(error)
     | Failure::Io(error)) = failure;
-    eprintln!("acies: {error:#}");
+    let mut text = error.to_string();
+    for cause in error.chain().skip(1).map(ToString::to_string) {
+        // Some errors say their cause themselves; once is enough.
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+    }
+    eprintln!("acies: {text}");
 }

@@ -347,6 +347,23 @@ fn devices_and_check_answer_in_json() {
     assert_eq!(status(&output), 0, "{}", text(&output.stderr));
     let told: Value = serde_json::from_slice(&output.stdout).expect("one JSON object");
     assert_eq!(told["mistakes"], Value::Array(Vec::new()));
+    let other = self::folder("check");
+    for name in ["cell.toml", "part.step"] {
+        fs::copy(folder.join(name), other.join(name)).expect("a copy");
+    }
+    let recipe = "datum_faces = [5]\n[[edge]]\nentity = 7\nname = \"x\"\n";
+    fs::write(other.join("recipe.toml"), recipe).expect("a recipe");
+    let output = acies(&["check", &other.join("cell.toml").display().to_string()]);
+    assert_eq!(status(&output), 65);
+    let told = text(&output.stderr);
+    assert!(
+        told.contains("datum_faces: #5, expected a face of the nominal"),
+        "{told}"
+    );
+    assert!(
+        told.contains("edge: Entity(7), expected a sharp edge of the nominal"),
+        "{told}"
+    );
     assert_eq!(status(&acies(&["chekc"])), 64);
     assert_eq!(status(&acies(&["--help"])), 0);
 }

@@ -1,11 +1,14 @@
 //! `acies check CELL.toml`: everything wrong with a configuration, touching no device.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use acies_drivers::device::Mistake;
 use anyhow::anyhow;
 
 use super::{Failure, Status, print_line};
-use crate::config::Cell;
+use crate::cell::{self, CellError};
+use crate::config::{Cell, ConfigErrors, LocatedMistake};
+use crate::inspect::recipe::EdgeKey;
 
 /// Reads a cell's configuration, its part and its recipe, and lists every mistake with its line.
 #[derive(Debug, clap::Args)]
@@ -24,18 +27,17 @@ impl Check {
     /// # Errors
     /// Bad input when the configuration has a mistake.
     pub fn run(self) -> Result<Status, Failure> {
-        let checked = Cell::read(&self.cell);
+        let checked = Cell::read(&self.cell).map_err(|errors| errors.mistakes);
+        let checked = checked.and_then(|cell| check_part(&cell).map(|()| cell));
         if self.json {
-            let mistakes: Vec<serde_json::Value> = match &checked {
-                Ok(_) => Vec::new(),
-                Err(errors) => errors.mistakes.iter().map(as_json).collect(),
-            };
-            print_line(
-                &serde_json::json!({ "cell": self.cell, "mistakes": mistakes }).to_string(),
-            )?;
+            let mistakes = checked.as_ref().err().into_iter().flatten();
+            let mistakes: Vec<serde_json::Value> = mistakes.map(as_json).collect();
+            let told = serde_json::json!({ "cell": self.cell, "mistakes": mistakes });
+            print_line(&told.to_string())?;
         }
-        let cell = checked.map_err(|errors| {
-            let n = errors.mistakes.len();
+        let cell = checked.map_err(|mistakes| {
+            let n = mistakes.len();
+            let errors = ConfigErrors { mistakes };
             Failure::BadInput(anyhow!(
                 "{n} mistake{} in the configuration\n{errors}",
                 if n == 1 { "" } else { "s" }
@@ -53,7 +55,75 @@ impl Check {
     }
 }
 
-fn as_json(mistake: &crate::config::LocatedMistake) -> serde_json::Value {
+/// Reads the part and its recipe, and looks for the faces and edges that the recipe names.
+fn check_part(cell: &Cell) -> Result<(), Vec<LocatedMistake>> {
+    let told = |file: &Path, key: &str, found: String, expected: &str| LocatedMistake {
+        file: file.to_owned(),
+        line: None,
+        place: String::new(),
+        mistake: Mistake {
+            key: key.to_owned(),
+            found,
+            expected: expected.to_owned(),
+        },
+    };
+    let recipe_file = cell.recipe.as_deref().unwrap_or(Path::new("recipe"));
+    let (nominal, recipe) = cell::read_part(cell).map_err(|error| match error {
+        CellError::Nominal(error) => {
+            vec![told(
+                &cell.nominal,
+                "nominal",
+                error.to_string(),
+                "a CAD file that can be read",
+            )]
+        }
+        other => vec![told(
+            recipe_file,
+            "recipe",
+            other.to_string(),
+            "a recipe without mistakes",
+        )],
+    })?;
+    let is_face = |entity: &u64| nominal.faces.iter().any(|face| face.entity == *entity);
+    let is_edge = |key: &EdgeKey| {
+        nominal.sharp_edges.iter().any(|edge| match key {
+            EdgeKey::Entity(entity) => edge.entity == *entity,
+            EdgeKey::Id(id) => edge.id == *id,
+        })
+    };
+    let faces = recipe
+        .datum_faces
+        .iter()
+        .filter(|entity| !is_face(entity))
+        .map(|entity| {
+            told(
+                recipe_file,
+                "datum_faces",
+                format!("#{entity}"),
+                "a face of the nominal",
+            )
+        });
+    let edges = recipe
+        .edges
+        .iter()
+        .filter(|edge| !is_edge(&edge.key))
+        .map(|edge| {
+            told(
+                recipe_file,
+                "edge",
+                format!("{:?}", edge.key),
+                "a sharp edge of the nominal",
+            )
+        });
+    let mistakes: Vec<LocatedMistake> = faces.chain(edges).collect();
+    if mistakes.is_empty() {
+        Ok(())
+    } else {
+        Err(mistakes)
+    }
+}
+
+fn as_json(mistake: &LocatedMistake) -> serde_json::Value {
     serde_json::json!({
         "line": mistake.line,
         "place": mistake.place,
