@@ -1,6 +1,6 @@
 //! Alignment of a scan to the nominal, measurement of every sharp edge, uncertainty, verdict.
 //!
-//! The way through: [`align`] finds the pose, [`assign`] the nominal face of every point, [`flank`] measures the deviation of
+//! The way through: [`align()`] finds the pose, [`assign`] the nominal face of every point, [`flank`] measures the deviation of
 //! each flank at every station, [`virtual_edge`] intersects them, [`verdict`] compares with the limits of the [`recipe`].
 
 pub mod align;

@@ -1,7 +1,7 @@
 //! Surfaces through measured points: moving least squares that keeps edges and corners sharp.
 //!
 //! [`Surface`] is the surface through a cloud; [`Surface::project`] takes any point near it onto it, [`reconstruct`] all the cloud's own
-//! points, [`resample`] spreads new points over it. Where a neighbourhood is smooth the projection is Levin's (Weber 2011, §2.3.2.2);
+//! points, [`resample()`] spreads new points over it. Where a neighbourhood is smooth the projection is Levin's (Weber 2011, §2.3.2.2);
 //! where it is not, the neighbourhood is first cut into flanks, and the projection works on one of them (Weber 2011, §4.3).
 //!
 //! We differ from the thesis in how the neighbourhood is cut. It draws a cubic Bézier curve through at least four marked feature points and
