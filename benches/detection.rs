@@ -4,8 +4,9 @@
 
 #![allow(clippy::print_stdout)]
 
-use acies::features::{Method, detect};
+use acies::features::{Class, Method, detect};
 use acies::points::Neighbors;
+use acies::points::picture::{self, ViewDirection, render};
 use glam::DVec3;
 
 #[path = "../tests/clouds/mod.rs"]
@@ -65,6 +66,13 @@ fn rows() -> Vec<Row> {
             let radius = percent / 100.0 * 8.5 / 0.25 * sampled.spacing;
             sampled.shaken(radius, 5)
         }));
+    }
+    if fandisk(10).is_some() {
+        rows.push(row("fandisk41k", 0.98, || {
+            fandisk(41_250).unwrap_or_default()
+        }));
+    } else {
+        println!("skipped: fandisk, ../shared/data is absent");
     }
     rows.push(row("part500k", 0.96, || {
         solids::block().sample(500_000, 0.1, 1)
@@ -129,9 +137,44 @@ fn rows() -> Vec<Row> {
     rows
 }
 
+/// Area samples of the fandisk, sharp where its faces turn by more than 25 degrees; none where the data folder is absent.
+fn fandisk(count: usize) -> Option<Sampled> {
+    let path = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../shared/data/models/fandisk.obj"
+    );
+    let text = std::fs::read_to_string(path).ok()?;
+    let (mut vertices, mut faces) = (Vec::new(), Vec::new());
+    for line in text.lines() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        match words.first() {
+            Some(&"v") => {
+                let x: Vec<f64> = words[1..4].iter().filter_map(|w| w.parse().ok()).collect();
+                vertices.push(DVec3::from_slice(&x));
+            }
+            Some(&"f") => {
+                let corner = |w: &str| w.split('/').next().and_then(|i| i.parse::<usize>().ok());
+                let f: Vec<usize> = words[1..4].iter().filter_map(|w| corner(w)).collect();
+                faces.push([f[0] - 1, f[1] - 1, f[2] - 1]);
+            }
+            _ => {}
+        }
+    }
+    Some(clouds::score::mesh(&vertices, &faces, count, 25.0))
+}
+
 /// Keeps the number of points near the same for all ratios.
 fn ratio_f(ratio: f64) -> f64 {
     ratio.sqrt() * 1.2
+}
+
+fn colour(class: &Class) -> [u8; 3] {
+    match class {
+        Class::None => picture::NONE,
+        Class::Edge => picture::EDGE,
+        Class::Corner => picture::CORNER,
+        Class::Boundary => picture::BOUNDARY,
+    }
 }
 
 fn main() {
@@ -174,6 +217,14 @@ fn main() {
             seconds,
             if score.f1() >= goal { "" } else { "<" },
         );
+        if let Ok(folder) = std::env::var("PICTURES") {
+            let name = row.name.replace([' ', ':', '%'], "-");
+            let colours: Vec<[u8; 3]> = found.classes.iter().map(colour).collect();
+            let view = ViewDirection::Along(DVec3::new(0.5, 0.7, -0.8));
+            let picture = render(&sampled.points, &colours, view, (1400, 1000));
+            let written = std::fs::write(format!("{folder}/{name}.png"), picture);
+            println!("    picture {name}.png {written:?}");
+        }
         if std::env::var_os("WRONG").is_some() {
             let mut bins = [0usize; 9];
             for (p, c) in sampled.points.iter().zip(&found.classes) {

@@ -77,7 +77,7 @@ pub struct Outcome {
 pub enum CellError {
     /// The nominal cannot be read.
     #[error("the part's nominal")]
-    Nominal(#[from] NominalError),
+    Nominal(#[source] Box<NominalError>),
     /// The recipe cannot be read.
     #[error("{path}: {source}; check that the file may be read")]
     RecipeFile {
@@ -102,7 +102,7 @@ pub enum CellError {
         device: String,
         /// Its reason.
         #[source]
-        source: DeviceError,
+        source: Box<DeviceError>,
     },
     /// A device is of another kind than its tables say.
     #[error(
@@ -127,7 +127,7 @@ pub enum CellError {
         index: usize,
         /// Its reason.
         #[source]
-        source: DeviceError,
+        source: Box<DeviceError>,
     },
     /// The scan did not start.
     #[error(transparent)]
@@ -165,7 +165,8 @@ pub fn run(
     links: &dyn Links,
     watch: &mut dyn FnMut(State),
 ) -> Result<Outcome, CellError> {
-    let nominal = Nominal::read(&cell.nominal)?;
+    let nominal =
+        Nominal::read(&cell.nominal).map_err(|error| CellError::Nominal(Box::new(error)))?;
     let recipe = read_recipe(cell.recipe.as_ref())?;
     let profilers = open_profilers(cell, links, watch)?;
     let (probes, touches) = touch_all(cell, links, watch)?;
@@ -208,7 +209,7 @@ fn open(
     });
     setup.open(links).map_err(|source| CellError::Device {
         device: device.to_owned(),
-        source,
+        source: Box::new(source),
     })
 }
 
@@ -239,12 +240,15 @@ fn open_profilers(
     Ok(opened)
 }
 
+/// The probes by name, and where they touched.
+type Touched = (Vec<(String, Identity)>, Vec<inspect::Touch>);
+
 /// Touches what the cell plans; the probes are closed again before the scan.
 fn touch_all(
     cell: &Cell,
     links: &dyn Links,
     watch: &mut dyn FnMut(State),
-) -> Result<(Vec<(String, Identity)>, Vec<inspect::Touch>), CellError> {
+) -> Result<Touched, CellError> {
     let of = cell.probes.iter().map(|probe| probe.touches.len()).sum();
     let mut touched = Vec::new();
     let mut identities = Vec::new();
@@ -292,7 +296,7 @@ fn touch(
         .map_err(|source| CellError::Touch {
             device: config.name.clone(),
             index: index + 1,
-            source,
+            source: Box::new(source),
         })
 }
 

@@ -9,6 +9,7 @@ use crate::points::{Neighbors, PointCloud, Spacing, noise_mm, spacing};
 
 mod adaptive;
 mod boundary;
+mod curves;
 mod flanks;
 mod lines;
 mod patch;
@@ -18,6 +19,7 @@ pub mod thesis;
 pub mod variation;
 
 use adaptive::{Places, Sights, THIN};
+pub use curves::{Curve, curves};
 use tangent::Tangents;
 
 /// What a point lies on. The discriminants are the values of `feature` in files.
@@ -208,15 +210,6 @@ fn in_lines(
         .collect();
     clock.lap("agreement");
     classes
-}
-
-/// A polyline along an edge, mm.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Curve {
-    /// Its vertices, in order.
-    pub points: Vec<DVec3>,
-    /// Whether the last joins the first.
-    pub closed: bool,
 }
 
 struct Clock {

@@ -67,7 +67,8 @@ pub const LEAST_POINTS: usize = 16;
 pub struct Settings {
     /// Degree of the local polynomials.
     pub degree: Degree,
-    /// h of the Gaussian weight, mm; by default it follows from noise and spacing at every point.
+    /// h of the Gaussian weight, mm; by default it follows from noise and spacing at every point. The neighbourhood's number of points does
+    /// not change with it.
     pub smoothing_mm: Option<f64>,
 }
 

@@ -86,9 +86,8 @@ impl Scores {
                     .push((deviation - expected) / measured.u_included_angle_rad);
             }
             if let Some(mean) = &edge.mean {
-                for i in 0..2 {
-                    self.mean_z
-                        .push((mean.d_mm[i] - truth[i] / n) / mean.u_d_mm[i]);
+                for (i, sum) in truth.iter().enumerate() {
+                    self.mean_z.push((mean.d_mm[i] - sum / n) / mean.u_d_mm[i]);
                 }
             }
         }

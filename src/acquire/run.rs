@@ -67,7 +67,7 @@ pub enum ScanError {
         device: String,
         /// Its reason.
         #[source]
-        source: DeviceError,
+        source: Box<DeviceError>,
     },
     /// No profilers were given.
     #[error(
@@ -110,7 +110,7 @@ pub fn scan(
         }
         return Err(ScanError::Start {
             device: profilers[started].name.clone(),
-            source,
+            source: Box::new(source),
         });
     }
     let done: Vec<AtomicBool> = profilers.iter().map(|_| AtomicBool::new(false)).collect();

@@ -56,23 +56,3 @@ impl CellProgress {
         self.bar.finish_and_clear();
     }
 }
-
-/// A line that says what is being worked on, where it takes longer than a second.
-pub(super) struct Working {
-    bar: ProgressBar,
-}
-
-impl Working {
-    /// Begins.
-    pub fn begin(what: &'static str) -> Self {
-        let bar = ProgressBar::new_spinner().with_message(what);
-        // The first tick, and with it the first drawing, comes when the quiet time is over.
-        bar.enable_steady_tick(QUIET);
-        Self { bar }
-    }
-
-    /// Takes the line away.
-    pub fn end(self) {
-        self.bar.finish_and_clear();
-    }
-}

@@ -30,8 +30,9 @@ pub struct Simulate {
     faults: String,
 }
 
-const AFTER: &str = "Faults, separated by commas (P is a probability, N counts profiles or probing moves):
-  lose=P lose-frame=P flip=P lie=P babble=P split lumps   on the wire: bytes and frames lost, changed, invented
+const AFTER: &str =
+    "Faults, separated by commas (P is a probability, N counts profiles or probing moves):
+  lose=P lose-frame=P flip=P lie=P babble=P split lumps baud=N   on the wire
   drop=P duplicate=P jump=N:COUNTS                        profiles dropped or doubled, encoder jumps
   silent-after=N reboot-after=N unplug-after=N replug-ms=M
   no-contact damage-prb=N alarm reset-in-move=N           the probe's";

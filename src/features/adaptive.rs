@@ -7,7 +7,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Class;
-use super::flanks::{Crease, FAR, Verdict, Workshop, overlooked_turn};
+use super::flanks::{Crease, Verdict, Workshop, overlooked_turn};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
 use crate::points::Neighbors;
@@ -15,7 +15,7 @@ use crate::points::Neighbors;
 /// Points looked at around a candidate, one level after the other as long as the answer is open.
 const LEVELS: [usize; 3] = [40, 100, 220];
 /// Flanks are allowed to depart from a quadric by this many spacings beside the noise.
-const MODEL_ERROR: f64 = 0.025;
+const MODEL_ERROR: f64 = 0.035;
 /// A point is marked when the edge passes within this many spacings.
 pub(super) const THIN: f64 = 0.9;
 /// Share of the neighbours that must see an edge for it to be believed.
@@ -40,7 +40,6 @@ pub(super) struct Places<'a> {
 pub(super) struct Sight {
     pub foot: DVec3,
     pub tangent: DVec3,
-    pub turn: f64,
     pub sd_mm: f64,
     pub corner: Option<DVec3>,
 }
@@ -49,8 +48,6 @@ pub(super) struct Sight {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Agreed {
     /// From the place to the edge, mm.
-    pub foot: DVec3,
-    pub tangent: DVec3,
     /// From the place to the edge, as a share of the distance at which it is marked.
     pub distance: f64,
     /// The same for the corner.
@@ -199,8 +196,6 @@ impl Places<'_> {
             let distance = at.length() * unit / thin;
             if share >= AGREEMENT && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
-                    foot: at * unit,
-                    tangent: sight.tangent,
                     distance,
                     corner_distance: None,
                 });
@@ -333,7 +328,6 @@ fn in_mm(crease: Crease, unit: f64) -> Sight {
     Sight {
         foot: crease.foot * unit,
         tangent: crease.tangent,
-        turn: crease.turn,
         sd_mm: crease.sd * unit,
         corner: crease.corner.map(|c| c * unit),
     }

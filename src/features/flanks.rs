@@ -16,7 +16,7 @@ const AGAINST: f64 = 6.0;
 /// Smallest turn angle, rad, that counts as sharp: 6 degrees.
 const LEAST_TURN: f64 = 0.105;
 /// Farthest foot, in spacings, that is of interest.
-pub(super) const FAR: f64 = 2.6;
+const FAR: f64 = 2.6;
 
 /// The largest turn angle, rad, of which a neighbourhood of `count` points within `reach` spacings can have failed to show clear
 /// evidence.

@@ -174,12 +174,12 @@ impl Knots {
     #[inline]
     fn raise(&self, span: usize, t: f64, degree: usize, row: &mut Basis) {
         let mut saved = 0.0;
-        for j in 0..degree {
+        for (j, value) in row.iter_mut().enumerate().take(degree) {
             let right = self.knots[span + 1 + j];
             let left = self.knots[span + 1 + j - degree];
             // right > left: both enclose the piece, which has a length.
-            let share = row[j] / (right - left);
-            row[j] = saved + (right - t) * share;
+            let share = *value / (right - left);
+            *value = saved + (right - t) * share;
             saved = (t - left) * share;
         }
         row[degree] = saved;

@@ -210,7 +210,9 @@ impl NurbsSurface {
             self.knots_v.points(),
         );
         let mut out = [DVec4::ZERO; 6];
-        for i in 0..=p {
+        let [value_u, first_u, second_u] = nu;
+        let weights = value_u.iter().zip(first_u).zip(second_u);
+        for (i, ((w, dw), ddw)) in weights.enumerate().take(p + 1) {
             let start = (su - p + i) * stride + sv - q;
             let row = &self.points[start..=start + q];
             let (mut a, mut da, mut dda) = (DVec4::ZERO, DVec4::ZERO, DVec4::ZERO);
@@ -219,12 +221,12 @@ impl NurbsSurface {
                 da += *point * nv[1][j];
                 dda += *point * nv[2][j];
             }
-            out[0] += a * nu[0][i];
-            out[1] += a * nu[1][i];
-            out[2] += da * nu[0][i];
-            out[3] += a * nu[2][i];
-            out[4] += da * nu[1][i];
-            out[5] += dda * nu[0][i];
+            out[0] += a * *w;
+            out[1] += a * *dw;
+            out[2] += da * *w;
+            out[3] += a * *ddw;
+            out[4] += da * *dw;
+            out[5] += dda * *w;
         }
         out
     }

@@ -323,7 +323,7 @@ impl Shapes<'_> {
         if is("QUASI_UNIFORM") {
             return Ok((0..count).map(|i| clamped(i) as f64).collect());
         }
-        if is("BEZIER") && (points - 1) % degree == 0 {
+        if is("BEZIER") && (points - 1).is_multiple_of(degree) {
             let pieces = (points - 1) / degree;
             let knot = |i: usize| (i.saturating_sub(1) / degree).min(pieces) as f64;
             return Ok((0..count).map(knot).collect());

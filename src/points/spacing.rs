@@ -144,7 +144,7 @@ fn quadric_variance(
     let plane = moments.plane();
     let reach = found[found.len() - 1].1.sqrt();
     let v = plane.normal.cross(plane.major);
-    let mut columns: Vec<Vec<f64>> = vec![Vec::with_capacity(found.len()); 7];
+    let mut columns: [Vec<f64>; 7] = std::array::from_fn(|_| Vec::with_capacity(found.len()));
     for (i, _) in &found {
         let d = (cloud.positions[*i as usize] - p - plane.centre) / reach;
         let (x, y) = (d.dot(plane.major), d.dot(v));
@@ -162,7 +162,7 @@ fn quadric_variance(
 }
 
 /// Squared length of the last column after taking out the others (Gram and Schmidt), and the rank of those.
-fn residual_after(mut columns: Vec<Vec<f64>>) -> (f64, usize) {
+fn residual_after(mut columns: [Vec<f64>; 7]) -> (f64, usize) {
     let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
     let mut rank = 0;
     for c in 0..columns.len() - 1 {

@@ -84,7 +84,8 @@ pub(super) struct Sink<'s> {
 
 /// Takes every point of `cloud` onto the surface through it.
 ///
-/// The result does not depend on the number of threads. Memory above the cloud and its neighbours: 50 bytes a point.
+/// The result does not depend on the number of threads. Memory above the cloud and its neighbours: 46 bytes a point, and while
+/// it works 320 for every point near an edge, for what it saw of the feature lines.
 ///
 /// # Errors
 /// [`SurfaceError::TooFewPoints`].

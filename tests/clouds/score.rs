@@ -123,3 +123,48 @@ pub fn oracle(sampled: &Sampled) -> Score {
         .collect();
     score(sampled, &found)
 }
+
+/// `count` area samples of a triangle mesh, whose true edges are those where neighbouring faces turn by more than `turn_deg`.
+pub fn mesh(vertices: &[DVec3], faces: &[[usize; 3]], count: usize, turn_deg: f64) -> Sampled {
+    let normal = |f: &[usize; 3]| {
+        let [a, b, c] = f.map(|i| vertices[i]);
+        (b - a).cross(c - a)
+    };
+    let mut sides: std::collections::BTreeMap<(usize, usize), Vec<DVec3>> = Default::default();
+    for f in faces {
+        for i in 0..3 {
+            let (a, b) = (f[i], f[(i + 1) % 3]);
+            let side = sides.entry((a.min(b), a.max(b))).or_default();
+            side.push(normal(f).normalize_or_zero());
+        }
+    }
+    let limit = turn_deg.to_radians().cos();
+    let sharp = sides
+        .iter()
+        .filter(|(_, n)| n.len() == 2 && n[0].dot(n[1]) < limit);
+    let edges = sharp
+        .map(|((a, b), _)| Line::Segment(vertices[*a], vertices[*b]))
+        .collect();
+    let mut ends = Vec::new();
+    let mut area = 0.0;
+    for f in faces {
+        area += 0.5 * normal(f).length();
+        ends.push(area);
+    }
+    let mut random = super::Random::new(21);
+    let points = (0..count)
+        .map(|_| {
+            let pick = random.unit() * area;
+            let f = faces[ends.partition_point(|e| *e < pick).min(faces.len() - 1)];
+            let [a, b, c] = f.map(|i| vertices[i]);
+            let (s, t) = (random.unit().sqrt(), random.unit());
+            a * (1.0 - s) + b * (s * (1.0 - t)) + c * (s * t)
+        })
+        .collect();
+    Sampled {
+        points,
+        spacing: (area / count as f64).sqrt(),
+        edges,
+        ..Sampled::default()
+    }
+}
