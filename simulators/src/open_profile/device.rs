@@ -149,11 +149,12 @@ impl Device {
         self.clock_ns = WARM_UP_NS;
         self.powered = Instant::now();
         let boot = self.boot;
+        // Last, so that whoever sees another start sees it off.
+        self.publish();
         self.shared.update(|status, _| {
             status.boot = boot;
             status.boots += 1;
         });
-        self.publish();
     }
 
     fn publish(&self) {
