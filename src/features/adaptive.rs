@@ -7,7 +7,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Class;
-use super::flanks::{Crease, Verdict, Workshop, overlooked_turn};
+use super::flanks::{Crease, LEAST_TURN, Verdict, Workshop};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
 use crate::points::Neighbors;
@@ -15,9 +15,10 @@ use crate::points::Neighbors;
 /// Points looked at around a candidate, one level after the other as long as the answer is open.
 const LEVELS: [usize; 3] = [40, 100, 220];
 /// Flanks are allowed to depart from a quadric by this many spacings beside the noise.
-const MODEL_ERROR: f64 = 0.035;
+const MODEL_ERROR: f64 = 0.017;
 /// A point is marked when the edge passes within this many spacings.
 pub(super) const THIN: f64 = 0.9;
+const CURVATURE_SD: f64 = 2.0;
 /// Share of the neighbours that must see an edge for it to be believed.
 const AGREEMENT: f64 = 0.45;
 
@@ -97,16 +98,17 @@ impl Places<'_> {
         if seen * n as f64 > variance * (freedom + 3.0 * (2.0 * freedom).sqrt()) {
             return true;
         }
-        // A normal over n points within radius r is good to 2 sigma / (r sqrt n) about each of two axes.
+        // A normal over n points within radius r is good to 2 sigma / (r sqrt n) about either axis, and its slope over such a
+        // neighbourhood, in which about four normals are independent, to that over r.
         let reach = f64::from(plane.reach_mm) / unit;
-        let tilt = 4.0 * variance / (reach * reach * n as f64);
-        tangents.spread(rank) > 3.0 * tilt
+        let sd = CURVATURE_SD * (variance / n as f64).sqrt() / (reach * reach);
+        let bend = tangents.curvature(&self.positions, rank) * unit;
+        bend > 3.5 * sd && bend * 2.0 * reach > LEAST_TURN
     }
 
     /// What is seen from the candidate `rank`, by growing its neighbourhood until the answer is clear.
     pub fn look(&self, tangents: &Tangents, rank: usize, shop: &mut Bench) -> Option<Sight> {
         let p = self.positions[rank];
-        let mut most_turn = std::f64::consts::PI;
         for level in LEVELS {
             self.neighbors.nearest_places(p, level, &mut shop.found);
             drop_ties(&mut shop.found);
@@ -114,12 +116,10 @@ impl Places<'_> {
             let unit = self.unit_mm(reach, shop.found.len());
             self.fill(tangents, p, unit, shop);
             let variance = self.variance(unit);
-            match shop.flanks.analyse(variance, most_turn) {
+            match shop.flanks.analyse(variance) {
                 Verdict::Smooth => return None,
                 Verdict::Creased(crease) => return Some(in_mm(crease, unit)),
-                Verdict::Unsure => {
-                    most_turn = overlooked_turn(variance, shop.found.len(), reach / unit);
-                }
+                Verdict::Unsure => {}
             }
         }
         None

@@ -2,7 +2,9 @@
 
 use glam::DVec3;
 
-use super::patch::{Fit, Plane, Surface, fit, foot, meeting};
+use crate::points::moments::Moments;
+
+use super::patch::{Fit, Plane, Surface, fit, foot, meeting, varying};
 
 /// Most surfaces a neighbourhood is split into before those that join smoothly are merged.
 const MOST_PLANES: usize = 5;
@@ -10,23 +12,19 @@ const MOST_PLANES: usize = 5;
 const MOST_SEEDS: usize = 16;
 /// Label of a point that belongs to no surface.
 const STRAY: u8 = u8::MAX;
-/// A crease is believed where the criterion prefers it by this much, and disbelieved where it is against it by [`AGAINST`].
+/// A crease is believed where the criterion prefers it by this much.
 const DECISIVE: f64 = 10.0;
-const AGAINST: f64 = 6.0;
+/// A crease that ought to be preferred by this much shows: of chi-squared its standard deviation is 13.
+const CLEAR: f64 = 45.0;
+const BENDING: f64 = 1.875;
 /// Smallest turn angle, rad, that counts as sharp: 6 degrees.
-const LEAST_TURN: f64 = 0.105;
+pub(super) const LEAST_TURN: f64 = 0.105;
 /// Farthest foot, in spacings, that is of interest.
 const FAR: f64 = 2.6;
 
-/// The largest turn angle, rad, of which a neighbourhood of `count` points within `reach` spacings can have failed to show clear
-/// evidence.
-///
-/// A crease of turn a through the middle departs from the best quadric by 0.09 reach tan(a / 2) in the mean square.
-pub(super) fn overlooked_turn(variance: f64, count: usize, reach: f64) -> f64 {
-    let missed = (4.0 * DECISIVE * variance / count as f64).sqrt();
-    2.0 * (missed / (0.09 * reach)).atan()
-}
-
+const DEPARTURE: f64 = 0.09;
+const MOST_TURN: f64 = 2.9;
+const LOCAL: f64 = 0.4;
 /// An edge as one neighbourhood sees it, relative to its point, in spacings.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Crease {
@@ -70,12 +68,14 @@ pub(super) struct Workshop {
 impl Workshop {
     /// What the neighbourhood in `points` is, at noise of variance `variance` (spacings squared).
     ///
-    /// `most_turn` (rad) is what smaller neighbourhoods, which saw no clear edge, have left possible.
-    pub fn analyse(&mut self, variance: f64, most_turn: f64) -> Verdict {
+    pub fn analyse(&mut self, variance: f64) -> Verdict {
         if self.points.len() < 8 {
             return Verdict::Smooth;
         }
         if let Some(verdict) = self.at_a_glance(variance) {
+            return verdict;
+        }
+        if let Some(verdict) = self.two_sided(variance) {
             return verdict;
         }
         let all = Plane::through(self.points.iter().copied());
@@ -83,21 +83,11 @@ impl Workshop {
         self.seeds.push(all);
         let mut planes = self.choose_planes(variance);
         if planes.len() < 2 {
-            return Verdict::Smooth;
+            return Verdict::Unsure;
         }
         self.assign(&mut planes, variance);
-        let (fits, doubt) = self.merge(planes.len() as u8, variance);
-        if fits.len() < 2 {
-            return if doubt < AGAINST {
-                Verdict::Unsure
-            } else {
-                Verdict::Smooth
-            };
-        }
-        match self.nearest_crease(&fits, (variance, most_turn)) {
-            Verdict::Smooth if doubt < AGAINST => Verdict::Unsure,
-            verdict => verdict,
-        }
+        let fits = self.merge(planes.len() as u8, variance);
+        self.nearest_crease(&fits, variance)
     }
 
     /// The verdict where one smooth surface explains all points so well that no crease could be decisive.
@@ -108,14 +98,71 @@ impl Workshop {
         if whole.squares > variance * (expected + 0.5 * DECISIVE) {
             return None;
         }
+        // A crease of turn a within the radius r bends the best quadric by 3.75 tan(a / 2) / r.
         let reach = self.points[n - 1].length();
-        let turn = 2.0 * whole.surface.curvature() * reach;
-        let smooth = turn < 0.7 * LEAST_TURN || turn > 1.5 * overlooked_turn(variance, n, reach);
+        let half_turn = whole.surface.curvature() * reach / BENDING;
+        let due = |tan: f64| n as f64 * (DEPARTURE * reach * tan).powi(2) / variance;
+        let least = (0.5 * LEAST_TURN).tan();
+        let smooth = due(half_turn) > CLEAR || (due(least) > CLEAR && half_turn < 0.7 * least);
         Some(if smooth {
             Verdict::Smooth
         } else {
             Verdict::Unsure
         })
+    }
+
+    /// The verdict where two surfaces side by side explain all points.
+    ///
+    /// The one quadric through all of them bends most across the crease; along that direction lies the cut that leaves the two flattest
+    /// sides.
+    fn two_sided(&mut self, variance: f64) -> Option<Verdict> {
+        const CUTS: usize = 16;
+        const FEWEST: f64 = 5.0;
+        let across = fit(&self.points, variance)?.surface.bending()?;
+        let cut_at = |i: usize| FAR * (2.0 * (i as f64 + 0.5) / CUTS as f64 - 1.0);
+        let mut bins = [Moments::default(); CUTS + 1];
+        for p in &self.points {
+            let x = p.dot(across);
+            let bin = ((x / FAR + 1.0) * 0.5 * CUTS as f64 + 0.5).clamp(0.0, CUTS as f64);
+            bins[bin as usize].add(*p);
+        }
+        let mut above = [Moments::default(); CUTS + 1];
+        for i in (0..CUTS).rev() {
+            above[i] = above[i + 1];
+            above[i].join(&bins[i + 1]);
+        }
+        let mut below = Moments::default();
+        let mut best: Option<(f64, usize)> = None;
+        for i in 0..CUTS {
+            below.join(&bins[i]);
+            if below.count() < FEWEST || above[i].count() < FEWEST {
+                continue;
+            }
+            let cost = below.count() * below.plane().variances[2]
+                + above[i].count() * above[i].plane().variances[2];
+            if best.is_none_or(|b| cost < b.0) {
+                best = Some((cost, i));
+            }
+        }
+        let cut = cut_at(best?.1);
+        self.labels.clear();
+        self.labels
+            .extend(self.points.iter().map(|p| u8::from(p.dot(across) > cut)));
+        let [first, second] = &mut self.parts;
+        first.clear();
+        second.clear();
+        for (p, label) in self.points.iter().zip(&self.labels) {
+            if *label == 0 { &mut *first } else { &mut *second }.push(*p);
+        }
+        let mut fits = [(0, fit(first, variance)?), (1, fit(second, variance)?)];
+        let (parts, _) = self.split(&fits[0], &fits[1], variance)?;
+        let n = self.points.len() as f64;
+        if parts[0].squares + parts[1].squares > variance * (n + 3.0 * (2.0 * n).sqrt()) {
+            return None;
+        }
+        fits[0].1 = parts[0];
+        fits[1].1 = parts[1];
+        Some(self.nearest_crease(&fits, variance))
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -235,10 +282,8 @@ impl Workshop {
         }
     }
 
-    /// Merges surfaces, best first, as long as one smooth surface explains two of them as well; what remains, and the least amount by
-    /// which the criterion was for or against the last decision.
-    fn merge(&mut self, count: u8, variance: f64) -> (Vec<(u8, Fit)>, f64) {
-        let mut doubt = f64::INFINITY;
+    /// Merges surfaces, best first, as long as one smooth surface explains two of them as well; what remains.
+    fn merge(&mut self, count: u8, variance: f64) -> Vec<(u8, Fit)> {
         let mut fits: Vec<(u8, Fit)> = (0..count)
             .filter_map(|s| {
                 let labelled = self.points.iter().zip(&self.labels);
@@ -271,7 +316,6 @@ impl Workshop {
             if change > DECISIVE {
                 break;
             }
-            doubt = doubt.min(-change);
             let (from, to) = (fits[i].0, fits[j].0);
             for label in self.labels.iter_mut().filter(|l| **l == from) {
                 *label = to;
@@ -279,7 +323,7 @@ impl Workshop {
             fits[j].1 = union;
             fits.remove(i);
         }
-        (fits, doubt)
+        fits
     }
 
     /// The two surfaces fitted anew after giving each of their points to the side of the crease on which it lies, and one surface
@@ -333,59 +377,73 @@ impl Workshop {
     }
 
     /// The nearest decisive crease between two of the surfaces.
-    fn nearest_crease(&mut self, fits: &[(u8, Fit)], (variance, most_turn): (f64, f64)) -> Verdict {
-        let mut best: Option<(f64, Crease)> = None;
-        let mut unsure = false;
+    fn nearest_crease(&mut self, fits: &[(u8, Fit)], variance: f64) -> Verdict {
+        let mut best: Option<Crease> = None;
+        let mut explained = false;
         for i in 0..fits.len() {
             for j in 0..i {
-                let Some((crease, evidence)) = self.crease(&fits[i], &fits[j], variance) else {
-                    continue;
-                };
-                if evidence < DECISIVE || crease.turn > most_turn {
-                    unsure |= evidence > -AGAINST && crease.turn <= most_turn;
-                    continue;
-                }
-                let d = crease.foot.length();
-                if best.as_ref().is_none_or(|b| d < b.0) {
-                    best = Some((d, crease));
+                match self.crease(fits, (i, j), variance) {
+                    Verdict::Unsure => {}
+                    Verdict::Smooth => explained = true,
+                    Verdict::Creased(crease) => {
+                        let nearer =
+                            |b: Crease| crease.foot.length_squared() < b.foot.length_squared();
+                        if best.is_none_or(nearer) {
+                            best = Some(crease);
+                        }
+                    }
                 }
             }
         }
-        match best {
-            Some((_, mut crease)) => {
-                crease.corner = if fits.len() > 2 {
-                    self.corner(fits)
-                } else {
-                    None
-                };
-                Verdict::Creased(crease)
-            }
-            None if unsure => Verdict::Unsure,
-            None => Verdict::Smooth,
+        let Some(mut crease) = best else {
+            return if explained {
+                Verdict::Smooth
+            } else {
+                Verdict::Unsure
+            };
+        };
+        if fits.len() > 2 {
+            crease.corner = self.corner(fits);
         }
+        Verdict::Creased(crease)
     }
 
-    /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt; and by how much the
-    /// criterion prefers it to one smooth surface.
+    /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt.
+    ///
+    /// Smooth where two surfaces there are, but no crease between them near enough.
     fn crease(
         &mut self,
-        one: &(u8, Fit),
-        other: &(u8, Fit),
+        all: &[(u8, Fit)],
+        (i, j): (usize, usize),
         variance: f64,
-    ) -> Option<(Crease, f64)> {
-        let (fits, whole) = self.split(one, other, variance)?;
-        let evidence =
-            whole.criterion(variance) - fits[0].criterion(variance) - fits[1].criterion(variance);
-        let surfaces = [fits[0].surface, fits[1].surface];
-        let (e, tangent) = foot(&surfaces[0], &surfaces[1], DVec3::ZERO)?;
-        if e.length_squared() > FAR * FAR {
-            return None;
+    ) -> Verdict {
+        let (one, other) = (&all[i], &all[j]);
+        let Some((fits, whole)) = self.split(one, other, variance) else {
+            return Verdict::Unsure;
+        };
+        let smooth = varying(&whole.surface, &self.whole, variance)
+            .unwrap_or(f64::INFINITY)
+            .min(whole.criterion(variance));
+        let evidence = smooth - fits[0].criterion(variance) - fits[1].criterion(variance);
+        if evidence < DECISIVE {
+            return Verdict::Unsure;
         }
-        let normals = surfaces.map(|s| s.height(e).1.normalize());
-        let across = self.directions([one.0, other.0], &surfaces, (e, tangent))?;
-        let cos = across[0].dot(across[1]);
-        let turn = (-cos).clamp(-1.0, 1.0).acos();
-        let sine = normals[0].cross(normals[1]).length().max(1e-6);
+        let elsewhere = if evidence > CLEAR {
+            Verdict::Smooth
+        } else {
+            Verdict::Unsure
+        };
+        let surfaces = [fits[0].surface, fits[1].surface];
+        let labels = [one.0, other.0];
+        let Some((e, tangent)) = foot(&surfaces[0], &surfaces[1], DVec3::ZERO)
+            .filter(|(e, _)| e.length_squared() < FAR * FAR && self.supported(labels, *e))
+        else {
+            return elsewhere;
+        };
+        let Some(across) = self.directions(labels, &surfaces, (e, tangent)) else {
+            return elsewhere;
+        };
+        let turn = (-across[0].dot(across[1])).clamp(-1.0, 1.0).acos();
         // At the end of a stretch of length L with n points a line is good to 2 sigma / sqrt n and its slope to sqrt 12 sigma / (L sqrt n);
         // a parabola to 3 sigma / sqrt n and sqrt 192 sigma / (L sqrt n).
         let (mut place, mut slope) = (0.0, 0.0);
@@ -396,17 +454,89 @@ impl Workshop {
             place += if bent { 9.0 } else { 4.0 } / n;
             slope += if bent { 192.0 } else { 12.0 } / (n * length2);
         }
-        let turn_sd = (variance * slope).sqrt();
-        let believable =
-            turn > LEAST_TURN.max(3.0 * turn_sd) && self.supported([one.0, other.0], e);
-        let crease = Crease {
-            foot: e,
-            tangent,
-            turn,
-            sd: (variance * place).sqrt() / sine,
-            corner: None,
+        if turn > MOST_TURN {
+            return Verdict::Smooth;
+        }
+        if turn < LEAST_TURN.max(3.0 * (variance * slope).sqrt()) {
+            return Verdict::Unsure;
+        }
+        match self.holds_nearby((all, labels), &fits, (e, turn), variance) {
+            Some(true) => Verdict::Creased(Crease {
+                foot: e,
+                tangent,
+                turn,
+                sd: (variance * place).sqrt() / turn.sin(),
+                corner: None,
+            }),
+            Some(false) => Verdict::Smooth,
+            None => Verdict::Unsure,
+        }
+    }
+
+    /// Whether the crease last split shows near its foot `e` too, as strongly as its `turn` (rad) must there.
+    ///
+    /// A crease turns at once, a curved surface over a length: only the former beats one smooth surface in the smallest neighbourhood that
+    /// could tell.
+    fn holds_nearby(
+        &mut self,
+        (all, labels): (&[(u8, Fit)], [u8; 2]),
+        fits: &[Fit; 2],
+        (e, turn): (DVec3, f64),
+        variance: f64,
+    ) -> Option<bool> {
+        const FEWEST: usize = 32;
+        self.costs.clear();
+        self.costs
+            .extend(self.points.iter().map(|p| p.distance_squared(e)));
+        self.costs.sort_unstable_by(f64::total_cmp);
+        let expected = |(k, d2): (usize, &f64)| {
+            (k + 1) as f64 * (DEPARTURE * (0.5 * turn).tan()).powi(2) * d2 / variance
         };
-        believable.then_some((crease, evidence))
+        let last = self.costs.len() - 1;
+        let k = (FEWEST.min(last)..last)
+            .find(|k| expected((*k, &self.costs[*k])) > 4.0 * DECISIVE)
+            .unwrap_or(last);
+        let (within, due) = (self.costs[k], expected((k, &self.costs[k])));
+        let near = |p: &&DVec3| p.distance_squared(e) <= within;
+        let cap = 9.0 * variance;
+        let mut creased = 0.0;
+        for s in 0..2 {
+            let mut count = 0;
+            for p in self.parts[s].iter().filter(near) {
+                creased += fits[s].surface.distance(*p).powi(2).min(cap) / variance;
+                count += 1;
+            }
+            creased += fits[s].parameters as f64 * f64::from(count.max(2)).ln();
+        }
+        self.whole.clear();
+        self.whole.extend(self.points.iter().filter(near));
+        let others = || {
+            let labelled = self.points.iter().zip(&self.labels);
+            labelled.filter(|(p, l)| near(p) && !labels.contains(l))
+        };
+        creased += 9.0 * others().filter(|(_, l)| all.iter().all(|f| f.0 != **l)).count() as f64;
+        for (label, fit) in all {
+            let mut count = 0;
+            for (p, _) in others().filter(|(_, l)| *l == label) {
+                creased += fit.surface.distance(*p).powi(2).min(cap) / variance;
+                count += 1;
+            }
+            if count > 0 {
+                creased += fit.parameters as f64 * f64::from(count.max(2)).ln();
+            }
+        }
+        let Some(whole) = fit(&self.whole, variance) else {
+            return None;
+        };
+        let smooth = varying(&whole.surface, &self.whole, variance)
+            .unwrap_or(f64::INFINITY)
+            .min(whole.criterion(variance));
+        let evidence = smooth - creased;
+        if evidence > (LOCAL * due).min(DECISIVE) {
+            Some(true)
+        } else {
+            (due > CLEAR - 5.0).then_some(false)
+        }
     }
 
     /// Unit directions from the foot into each surface, across the edge.

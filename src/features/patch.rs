@@ -101,6 +101,20 @@ impl Surface {
         mean.abs() + (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt()
     }
 
+    /// Unit direction in which the middle of a curved fit bends most.
+    pub fn bending(&self) -> Option<DVec3> {
+        let [xx, xy, yy] = [
+            2.0 * self.coefficients[3],
+            self.coefficients[4],
+            2.0 * self.coefficients[5],
+        ];
+        let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
+        let along = |a: f64| self.frame[0] * a.cos() + self.frame[1] * a.sin();
+        // The angle is that of the larger, not of the stronger curvature.
+        let strong = if xx + yy < 0.0 { angle + 0.5 * std::f64::consts::PI } else { angle };
+        self.is_curved().then(|| along(strong))
+    }
+
     /// Whether the surface is curved.
     pub fn is_curved(&self) -> bool {
         self.coefficients[3..].iter().any(|c| *c != 0.0)
@@ -159,6 +173,53 @@ pub(super) fn fit(points: &[DVec3], variance: f64) -> Option<Fit> {
     })
 }
 
+/// What the height function of fourth degree over the frame of `under` leaves over: the criterion of a surface whose curvature changes.
+pub(super) fn varying(under: &Surface, points: &[DVec3], variance: f64) -> Option<f64> {
+    const TERMS: usize = 15;
+    let count = points.len();
+    if count < 2 * TERMS {
+        return None;
+    }
+    let reach = points.iter().map(|p| under.local(*p)).fold(0.0, |r: f64, [x, y, _]| r.max(x * x + y * y)).sqrt();
+    let row = |p: DVec3| {
+        let [x, y, z] = under.local(p).map(|c| c / reach);
+        let (x2, y2) = (x * x, y * y);
+        let c = &under.coefficients;
+        let hx = c[1] + reach * (2.0 * c[3] * x + c[4] * y);
+        let hy = c[2] + reach * (c[4] * x + 2.0 * c[5] * y);
+        (
+            [
+                1.0, x, y, x2, x * y, y2, x2 * x, x2 * y, x * y2, y2 * y, x2 * x2, x2 * x * y, x2 * y2, x * y * y2, y2 * y2,
+            ],
+            z,
+            1.0 / (1.0 + hx * hx + hy * hy),
+        )
+    };
+    let mut a = [[0.0; TERMS]; TERMS];
+    let mut b = [0.0; TERMS];
+    for p in points {
+        let (row, z, weight) = row(*p);
+        for i in 0..TERMS {
+            let w = weight * row[i];
+            b[i] += w * z;
+            for j in i..TERMS {
+                a[i][j] += w * row[j];
+            }
+        }
+    }
+    let c = solve(a, b)?;
+    let cap = 9.0 * variance;
+    let squares: f64 = points
+        .iter()
+        .map(|p| {
+            let (row, z, weight) = row(*p);
+            let h: f64 = row.iter().zip(&c).map(|(r, c)| r * c).sum();
+            ((z - h).powi(2) * weight * reach * reach).min(cap)
+        })
+        .sum();
+    Some(squares / variance + TERMS as f64 * (count as f64).ln())
+}
+
 /// Least squares of the six coefficients in the frame of `start`, each height weighted by the slope of `start` there.
 fn bend(start: &Surface, points: &[DVec3]) -> Option<Surface> {
     let mut a = [[0.0; 6]; 6];
@@ -189,7 +250,7 @@ fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; 
     let scale = (0..N).map(|i| a[i][i]).fold(0.0, f64::max);
     for k in 0..N {
         let pivot = a[k][k];
-        if pivot.is_nan() || pivot <= 1e-10 * scale {
+        if pivot.is_nan() || pivot <= 1e-12 * scale {
             return None;
         }
         for i in k + 1..N {

@@ -63,15 +63,38 @@ impl Tangents {
         &list[..len]
     }
 
-    /// Mean squared sine between the normal of a place and those of its neighbours: the spread of its Gauss map.
-    pub fn spread(&self, rank: usize) -> f64 {
+    /// Largest curvature at a place, 1/mm: how the normals of its neighbours change with the way to them.
+    pub fn curvature(&self, positions: &[DVec3], rank: usize) -> f64 {
         let n = self.planes[rank].normal();
-        let around = self.around(rank);
-        let sum: f64 = around
-            .iter()
-            .map(|j| 1.0 - n.dot(self.planes[*j as usize].normal()).powi(2))
-            .sum();
-        sum / around.len().max(1) as f64
+        let u = n.any_orthonormal_vector();
+        let v = n.cross(u);
+        // Sums of the way's squares, and of its products with the change of the normal.
+        let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
+        let mut change = [[0.0; 2]; 2];
+        for j in self.around(rank) {
+            let d = positions[*j as usize] - positions[rank];
+            let (x, y) = (d.dot(u), d.dot(v));
+            let m = self.planes[*j as usize].normal();
+            let m = if m.dot(n) < 0.0 { -m } else { m };
+            let (a, b) = (m.dot(u), m.dot(v));
+            xx += x * x;
+            xy += x * y;
+            yy += y * y;
+            change[0][0] += a * x;
+            change[0][1] += a * y;
+            change[1][0] += b * x;
+            change[1][1] += b * y;
+        }
+        let det = xx * yy - xy * xy;
+        if det.is_nan() || det <= 1e-6 * (xx + yy).powi(2) {
+            return f64::INFINITY;
+        }
+        let p = (change[0][0] * yy - change[0][1] * xy) / det;
+        let s = (change[1][1] * xx - change[1][0] * xy) / det;
+        let q = (change[0][1] * xx - change[0][0] * xy) / det;
+        let r = (change[1][0] * yy - change[1][1] * xy) / det;
+        let mixed = 0.5 * (q + r);
+        0.5 * (p + s).abs() + (0.25 * (p - s) * (p - s) + mixed * mixed).sqrt()
     }
 }
 

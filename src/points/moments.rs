@@ -35,6 +35,14 @@ impl Moments {
         self.mixed += DVec3::new(p.y * p.z, p.z * p.x, p.x * p.y);
     }
 
+    /// Takes in all points of `other`.
+    pub fn join(&mut self, other: &Self) {
+        self.n += other.n;
+        self.sum += other.sum;
+        self.square += other.square;
+        self.mixed += other.mixed;
+    }
+
     /// Number of points.
     pub fn count(&self) -> f64 {
         self.n
