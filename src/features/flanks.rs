@@ -16,13 +16,14 @@ const STRAY: u8 = u8::MAX;
 const DECISIVE: f64 = 10.0;
 /// A crease that ought to be preferred by this much shows: of chi-squared its standard deviation is 13.
 const CLEAR: f64 = 45.0;
-const BENDING: f64 = 1.875;
+const STEEP: f64 = 0.7;
+const BENDING: f64 = 2.036;
 /// Smallest turn angle, rad, that counts as sharp: 6 degrees.
 pub(super) const LEAST_TURN: f64 = 0.105;
 /// Farthest foot, in spacings, that is of interest.
 const FAR: f64 = 2.6;
 
-const DEPARTURE: f64 = 0.09;
+const DEPARTURE: f64 = 0.071;
 const MOST_TURN: f64 = 2.9;
 const LOCAL: f64 = 0.4;
 /// An edge as one neighbourhood sees it, relative to its point, in spacings.
@@ -95,16 +96,24 @@ impl Workshop {
         let whole = fit(&self.points, variance)?;
         let n = self.points.len();
         let expected = (n - whole.parameters.min(n)) as f64;
-        if whole.squares > variance * (expected + 0.5 * DECISIVE) {
-            return None;
-        }
-        // A crease of turn a within the radius r bends the best quadric by 3.75 tan(a / 2) / r.
+        // A crease of turn a within the radius r bends the best quadric by 4.07 tan(a / 2) / r.
         let reach = self.points[n - 1].length();
         let half_turn = whole.surface.curvature() * reach / BENDING;
         let due = |tan: f64| n as f64 * (DEPARTURE * reach * tan).powi(2) / variance;
+        if half_turn < STEEP {
+            let squares: f64 = (self.points.iter())
+                .map(|p| whole.surface.distance(*p).powi(2))
+                .sum();
+            let missing = due(half_turn) - (squares / variance - expected);
+            if missing > 2.5 * (2.0 * n as f64 + 4.0 * due(half_turn)).sqrt() {
+                return Some(Verdict::Smooth);
+            }
+        }
+        if whole.squares > variance * (expected + 0.5 * DECISIVE) {
+            return None;
+        }
         let least = (0.5 * LEAST_TURN).tan();
-        let smooth = due(half_turn) > CLEAR || (due(least) > CLEAR && half_turn < 0.7 * least);
-        Some(if smooth {
+        Some(if due(least) > CLEAR && half_turn < 0.7 * least {
             Verdict::Smooth
         } else {
             Verdict::Unsure
