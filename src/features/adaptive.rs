@@ -18,6 +18,7 @@ const LEVELS: [usize; 3] = [40, 100, 220];
 const MODEL_ERROR: f64 = 0.017;
 /// A point is marked when the edge passes within this many spacings.
 pub(super) const THIN: f64 = 0.9;
+const FAINT: f64 = 0.35;
 const CURVATURE_SD: f64 = 2.0;
 /// Share of the neighbours that must see an edge for it to be believed.
 const AGREEMENT: f64 = 0.45;
@@ -118,11 +119,41 @@ impl Places<'_> {
             let variance = self.variance(unit);
             match shop.flanks.analyse(variance) {
                 Verdict::Smooth => return None,
-                Verdict::Creased(crease) => return Some(in_mm(crease, unit)),
+                Verdict::Creased(crease) => {
+                    let stays = !self.goes_on(tangents, (p, unit), &crease, shop);
+                    return stays.then(|| in_mm(crease, unit));
+                }
                 Verdict::Unsure => {}
             }
         }
         None
+    }
+
+    /// Whether a faint crease is but the first step of a surface that goes on turning: where a fillet, or the facets of one, begins.
+    ///
+    /// The tangent planes from three to six spacings beside the crease have turned farther from the flank than the crease turns.
+    fn goes_on(&self, tangents: &Tangents, (p, unit): (DVec3, f64), crease: &Crease, shop: &mut Bench) -> bool {
+        if crease.turn > FAINT {
+            return false;
+        }
+        self.neighbors.nearest_places(p, LEVELS[1], &mut shop.found);
+        let inward = (crease.into[0] - crease.into[1]).normalize_or_zero();
+        (0..2).any(|side| {
+            let flank = crease.into[side].cross(crease.tangent);
+            let mut turns = [0f64; LEVELS[1]];
+            let mut count = 0;
+            for (rank, _) in &shop.found {
+                let d = (self.positions[*rank as usize] - p) / unit - crease.foot;
+                let across = d.dot(inward) * [1.0, -1.0][side];
+                if d.dot(crease.tangent).abs() < 2.0 && (3.0..6.0).contains(&across) {
+                    let normal = tangents.planes[*rank as usize].normal();
+                    turns[count] = normal.dot(flank).abs().min(1.0).acos();
+                    count += 1;
+                }
+            }
+            let turns = &mut turns[..count];
+            count >= 5 && *turns.select_nth_unstable_by(count / 2, f64::total_cmp).1 > crease.turn
+        })
     }
 
     /// Puts the neighbourhood and the best tangent planes in it on the bench.

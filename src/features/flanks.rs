@@ -35,6 +35,8 @@ pub(super) struct Crease {
     pub tangent: DVec3,
     /// Angle between the normals, 0 to pi.
     pub turn: f64,
+    /// Unit directions from the foot into each surface, across the edge.
+    pub into: [DVec3; 2],
     /// Standard deviation of the foot across the edge.
     pub sd: f64,
     /// Where three or more surfaces meet nearby.
@@ -474,6 +476,7 @@ impl Workshop {
                 foot: e,
                 tangent,
                 turn,
+                into: across,
                 sd: (variance * place).sqrt() / turn.sin(),
                 corner: None,
             }),
