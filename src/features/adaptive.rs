@@ -17,7 +17,7 @@ const LEVELS: [usize; 3] = [40, 100, 220];
 /// Flanks are allowed to depart from a quadric by this many spacings beside the noise.
 const MODEL_ERROR: f64 = 0.017;
 /// A point is marked when the edge passes within this many spacings.
-pub(super) const THIN: f64 = 0.9;
+pub(super) const THIN: f64 = 0.97;
 const FAINT: f64 = 0.35;
 const CURVATURE_SD: f64 = 2.0;
 /// Share of the neighbours that must see an edge for it to be believed.
@@ -219,12 +219,12 @@ impl Places<'_> {
         if seeing < 3 {
             return None;
         }
-        let thin = self.thin_mm * (unit / self.spacing_mm);
+        let thin = self.thin_mm / self.spacing_mm;
         let witnesses = &witnesses[..around.len()];
         let mut best: Option<Agreed> = None;
         for (foot, sight) in witnesses.iter().filter_map(|w| w.sight).take(8) {
             let (share, at) = fit_feet(witnesses, (foot, sight.tangent), unit);
-            let distance = at.length() * unit / thin;
+            let distance = at.length() / (thin - (sight.sd_mm / unit).min(0.2));
             if share >= AGREEMENT && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
                     distance,
@@ -235,7 +235,7 @@ impl Places<'_> {
         let mut agreed = best?;
         agreed.corner_distance = self
             .corner(around, sights, (p, unit))
-            .map(|d| d * unit / thin);
+            .map(|d| d / thin);
         Some(agreed)
     }
 
