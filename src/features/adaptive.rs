@@ -85,25 +85,34 @@ impl Places<'_> {
         }
     }
 
-    /// Flatness test: whether the neighbourhood departs from a plane by more than noise does.
+    /// Whether the neighbourhood departs from its plane by no more than noise does.
+    fn is_flat(&self, tangents: &Tangents, rank: usize) -> bool {
+        let plane = &tangents.planes[rank];
+        let n = f64::from(plane.count);
+        let unit = self.unit_mm(f64::from(plane.reach_mm), plane.count as usize);
+        let seen = f64::from(plane.variance_mm2) / (unit * unit);
+        let freedom = n - 3.0;
+        seen * n <= self.variance(unit) * (freedom + 3.0 * (2.0 * freedom).sqrt())
+    }
+
+    /// Flatness test: whether an edge may be near, because the neighbourhood is no plane, or because planes in it change their
+    /// direction.
     pub fn is_candidate(&self, tangents: &Tangents, rank: usize) -> bool {
         let plane = &tangents.planes[rank];
-        let n = tangents.around(rank).len();
-        if n < 8 {
+        if plane.count < 8 {
             return false;
         }
-        let unit = self.unit_mm(f64::from(plane.reach_mm), n);
-        let variance = self.variance(unit);
-        let seen = f64::from(plane.variance_mm2) / (unit * unit);
-        let freedom = n as f64 - 3.0;
-        if seen * n as f64 > variance * (freedom + 3.0 * (2.0 * freedom).sqrt()) {
+        if !self.is_flat(tangents, rank) {
             return true;
         }
         // A normal over n points within radius r is good to 2 sigma / (r sqrt n) about either axis, and its slope over such a
         // neighbourhood, in which about four normals are independent, to that over r.
+        let unit = self.unit_mm(f64::from(plane.reach_mm), plane.count as usize);
         let reach = f64::from(plane.reach_mm) / unit;
-        let sd = CURVATURE_SD * (variance / n as f64).sqrt() / (reach * reach);
-        let bend = tangents.curvature(&self.positions, rank) * unit;
+        let sd = CURVATURE_SD * (self.variance(unit) / f64::from(plane.count)).sqrt() / (reach * reach);
+        // Where a neighbour's plane is none, a sharp edge is near that one, not this.
+        let flat = |j: usize| self.is_flat(tangents, j);
+        let bend = tangents.curvature(&self.positions, rank, flat) * unit;
         bend > 3.5 * sd && bend * 2.0 * reach > LEAST_TURN
     }
 

@@ -81,6 +81,9 @@ impl Workshop {
         if let Some(verdict) = self.two_sided(variance) {
             return verdict;
         }
+        if self.is_plane(variance) {
+            return Verdict::Unsure;
+        }
         let all = Plane::through(self.points.iter().copied());
         self.add_small_planes();
         self.seeds.push(all);
@@ -119,6 +122,14 @@ impl Workshop {
             Verdict::Smooth
         } else {
             Verdict::Unsure
+        })
+    }
+
+    /// Whether one plane explains the points as far as chance goes.
+    fn is_plane(&self, variance: f64) -> bool {
+        let n = self.points.len() as f64;
+        fit(&self.points, variance).is_some_and(|f| {
+            !f.surface.is_curved() && f.squares < variance * (n + 4.0 * (2.0 * n).sqrt())
         })
     }
 

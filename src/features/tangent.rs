@@ -22,6 +22,8 @@ pub(super) struct Tangent {
     pub variance_mm2: f32,
     /// Radius of the neighbourhood, mm.
     pub reach_mm: f32,
+    /// Points in it.
+    pub count: u32,
 }
 
 impl Tangent {
@@ -63,8 +65,13 @@ impl Tangents {
         &list[..len]
     }
 
-    /// Largest curvature at a place, 1/mm: how the normals of its neighbours change with the way to them.
-    pub fn curvature(&self, positions: &[DVec3], rank: usize) -> f64 {
+    /// Largest curvature at a place, 1/mm: how the normals of those neighbours that are `flat` change with the way to them.
+    pub fn curvature(
+        &self,
+        positions: &[DVec3],
+        rank: usize,
+        flat: impl Fn(usize) -> bool,
+    ) -> f64 {
         let n = self.planes[rank].normal();
         let u = n.any_orthonormal_vector();
         let v = n.cross(u);
@@ -72,6 +79,9 @@ impl Tangents {
         let (mut xx, mut xy, mut yy) = (0.0, 0.0, 0.0);
         let mut change = [[0.0; 2]; 2];
         for j in self.around(rank) {
+            if !flat(*j as usize) {
+                continue;
+            }
             let d = positions[*j as usize] - positions[rank];
             let (x, y) = (d.dot(u), d.dot(v));
             let m = self.planes[*j as usize].normal();
@@ -119,5 +129,6 @@ fn tangent(positions: &[DVec3], p: DVec3, found: &[(u32, f64)]) -> Tangent {
         height_mm: -fit.normal.dot(fit.centre) as f32,
         variance_mm2: fit.variances[2] as f32,
         reach_mm: found.last().map_or(0.0, |f| f.1.sqrt()) as f32,
+        count: found.len() as u32,
     }
 }
