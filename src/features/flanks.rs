@@ -75,13 +75,17 @@ impl Workshop {
         if self.points.len() < 8 {
             return Verdict::Smooth;
         }
-        if let Some(verdict) = self.at_a_glance(variance) {
+        let Some(whole) = fit(&self.points, variance) else {
+            return Verdict::Smooth;
+        };
+        if let Some(verdict) = self.at_a_glance(&whole, variance) {
             return verdict;
         }
-        if let Some(verdict) = self.two_sided(variance) {
+        if let Some(verdict) = self.two_sided(&whole, variance) {
             return verdict;
         }
-        if self.is_plane(variance) {
+        let n = self.points.len() as f64;
+        if !whole.surface.is_curved() && whole.squares < variance * (n + 4.0 * (2.0 * n).sqrt()) {
             return Verdict::Unsure;
         }
         let all = Plane::through(self.points.iter().copied());
@@ -97,8 +101,7 @@ impl Workshop {
     }
 
     /// The verdict where one smooth surface explains all points so well that no crease could be decisive.
-    fn at_a_glance(&self, variance: f64) -> Option<Verdict> {
-        let whole = fit(&self.points, variance)?;
+    fn at_a_glance(&self, whole: &Fit, variance: f64) -> Option<Verdict> {
         let n = self.points.len();
         let expected = (n - whole.parameters.min(n)) as f64;
         // A crease of turn a within the radius r bends the best quadric by 4.07 tan(a / 2) / r.
@@ -125,22 +128,14 @@ impl Workshop {
         })
     }
 
-    /// Whether one plane explains the points as far as chance goes.
-    fn is_plane(&self, variance: f64) -> bool {
-        let n = self.points.len() as f64;
-        fit(&self.points, variance).is_some_and(|f| {
-            !f.surface.is_curved() && f.squares < variance * (n + 4.0 * (2.0 * n).sqrt())
-        })
-    }
-
     /// The verdict where two surfaces side by side explain all points.
     ///
     /// The one quadric through all of them bends most across the crease; along that direction lies the cut that leaves the two flattest
     /// sides.
-    fn two_sided(&mut self, variance: f64) -> Option<Verdict> {
+    fn two_sided(&mut self, whole: &Fit, variance: f64) -> Option<Verdict> {
         const CUTS: usize = 16;
         const FEWEST: f64 = 5.0;
-        let across = fit(&self.points, variance)?.surface.bending()?;
+        let across = whole.surface.bending()?;
         let cut_at = |i: usize| FAR * (2.0 * (i as f64 + 0.5) / CUTS as f64 - 1.0);
         let mut bins = [Moments::default(); CUTS + 1];
         for p in &self.points {
@@ -176,15 +171,13 @@ impl Workshop {
         for (p, label) in self.points.iter().zip(&self.labels) {
             if *label == 0 { &mut *first } else { &mut *second }.push(*p);
         }
-        let mut fits = [(0, fit(first, variance)?), (1, fit(second, variance)?)];
-        let (parts, _) = self.split(&fits[0], &fits[1], variance)?;
+        let fits = [(0, fit(first, variance)?), (1, fit(second, variance)?)];
+        let parts = self.split(&fits[0], &fits[1], variance)?;
         let n = self.points.len() as f64;
         if parts[0].squares + parts[1].squares > variance * (n + 3.0 * (2.0 * n).sqrt()) {
             return None;
         }
-        fits[0].1 = parts[0];
-        fits[1].1 = parts[1];
-        Some(self.nearest_crease(&fits, variance))
+        Some(self.crease(&fits, (0, 1), (parts, *whole), variance))
     }
 
     /// Seeds of their own: planes through the seven points nearest to each of eight points far apart.
@@ -321,7 +314,10 @@ impl Workshop {
             let mut best: Option<(f64, usize, usize, Fit)> = None;
             for i in 0..fits.len() {
                 for j in 0..i {
-                    let Some((parts, whole)) = self.split(&fits[i], &fits[j], variance) else {
+                    let Some(parts) = self.split(&fits[i], &fits[j], variance) else {
+                        continue;
+                    };
+                    let Some(whole) = fit(&self.whole, variance) else {
                         continue;
                     };
                     let change = whole.criterion(variance)
@@ -348,8 +344,7 @@ impl Workshop {
         fits
     }
 
-    /// The two surfaces fitted anew after giving each of their points to the side of the crease on which it lies, and one surface
-    /// through all of these points.
+    /// The two surfaces fitted anew after giving each of their points, which are left in `whole`, to the side of the crease on which it lies.
     ///
     /// The side is that of the surface which halves the angle: unlike the nearer of the two, it does not select by noise.
     fn split(
@@ -357,7 +352,7 @@ impl Workshop {
         one: &(u8, Fit),
         other: &(u8, Fit),
         variance: f64,
-    ) -> Option<([Fit; 2], Fit)> {
+    ) -> Option<[Fit; 2]> {
         let mut fits = [one.1, other.1];
         let labelled = self.points.iter().zip(&self.labels);
         self.whole.clear();
@@ -381,8 +376,7 @@ impl Workshop {
             }
             fits = [fit(first, variance)?, fit(second, variance)?];
         }
-        let whole = fit(&self.whole, variance)?;
-        Some((fits, whole))
+        Some(fits)
     }
 
     /// On which side of the other surface each one's points lie: their signs.
@@ -404,7 +398,13 @@ impl Workshop {
         let mut explained = false;
         for i in 0..fits.len() {
             for j in 0..i {
-                match self.crease(fits, (i, j), variance) {
+                let Some(parts) = self.split(&fits[i], &fits[j], variance) else {
+                    continue;
+                };
+                let Some(whole) = fit(&self.whole, variance) else {
+                    continue;
+                };
+                match self.crease(fits, (i, j), (parts, whole), variance) {
                     Verdict::Unsure => {}
                     Verdict::Smooth => explained = true,
                     Verdict::Creased(crease) => {
@@ -430,23 +430,18 @@ impl Workshop {
         Verdict::Creased(crease)
     }
 
-    /// The crease between two surfaces: their intersection, where both have points and the turn is beyond doubt.
+    /// The crease between two surfaces last split: their intersection, where both have points and the turn is beyond doubt.
     ///
     /// Smooth where two surfaces there are, but no crease between them near enough.
     fn crease(
         &mut self,
         all: &[(u8, Fit)],
         (i, j): (usize, usize),
+        (fits, whole): ([Fit; 2], Fit),
         variance: f64,
     ) -> Verdict {
-        let (one, other) = (&all[i], &all[j]);
-        let Some((fits, whole)) = self.split(one, other, variance) else {
-            return Verdict::Unsure;
-        };
-        let smooth = varying(&whole.surface, &self.whole, variance)
-            .unwrap_or(f64::INFINITY)
-            .min(whole.criterion(variance));
-        let evidence = smooth - fits[0].criterion(variance) - fits[1].criterion(variance);
+        let evidence =
+            whole.criterion(variance) - fits[0].criterion(variance) - fits[1].criterion(variance);
         if evidence < DECISIVE {
             return Verdict::Unsure;
         }
@@ -456,7 +451,7 @@ impl Workshop {
             Verdict::Unsure
         };
         let surfaces = [fits[0].surface, fits[1].surface];
-        let labels = [one.0, other.0];
+        let labels = [all[i].0, all[j].0];
         let Some((e, tangent)) = foot(&surfaces[0], &surfaces[1], DVec3::ZERO)
             .filter(|(e, _)| e.length_squared() < FAR * FAR && self.supported(labels, *e))
         else {

@@ -156,6 +156,11 @@ pub(super) fn fit(points: &[DVec3], variance: f64) -> Option<Fit> {
             return Some(simple);
         };
         curved = better;
+        // Weights by a slope of a fifth differ from one by four percent.
+        let reach2 = 4.0 * plane.variances[0];
+        if curved.curvature().powi(2) * reach2 < 0.04 {
+            break;
+        }
     }
     let bent = Fit {
         surface: curved,
