@@ -126,7 +126,7 @@ impl Places<'_> {
             let unit = self.unit_mm(reach, shop.found.len());
             self.fill(tangents, p, unit, shop);
             let variance = self.variance(unit);
-            match shop.flanks.analyse(variance) {
+            match shop.flanks.analyse(variance, level < LEVELS[2]) {
                 Verdict::Smooth => return None,
                 Verdict::Creased(crease) => {
                     let stays = !self.goes_on(tangents, (p, unit), &crease, shop);

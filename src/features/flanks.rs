@@ -71,7 +71,7 @@ pub(super) struct Workshop {
 impl Workshop {
     /// What the neighbourhood in `points` is, at noise of variance `variance` (spacings squared).
     ///
-    pub fn analyse(&mut self, variance: f64) -> Verdict {
+    pub fn analyse(&mut self, variance: f64, many: bool) -> Verdict {
         if self.points.len() < 8 {
             return Verdict::Smooth;
         }
@@ -86,6 +86,9 @@ impl Workshop {
         }
         let n = self.points.len() as f64;
         if !whole.surface.is_curved() && whole.squares < variance * (n + 4.0 * (2.0 * n).sqrt()) {
+            return Verdict::Unsure;
+        }
+        if !many {
             return Verdict::Unsure;
         }
         let all = Plane::through(self.points.iter().copied());

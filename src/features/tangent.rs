@@ -123,12 +123,29 @@ fn tangent(positions: &[DVec3], p: DVec3, found: &[(u32, f64)]) -> Tangent {
     for (rank, _) in found {
         moments.add(positions[*rank as usize] - p);
     }
-    let fit = moments.plane();
+    let mut fit = moments.plane();
+    // One stray point tilts a plane and widens it; noise gives the farthest of 24 a quarter of the squares, an edge less.
+    let squares = |(rank, _): &&(u32, f64)| {
+        fit.normal
+            .dot(positions[*rank as usize] - p - fit.centre)
+            .powi(2)
+    };
+    let farthest = found
+        .iter()
+        .max_by(|a, b| squares(a).total_cmp(&squares(b)))
+        .filter(|f| found.len() > 8 && squares(f) > 0.5 * fit.variances[2] * moments.count());
+    if let Some(stray) = farthest {
+        moments = Moments::default();
+        for (rank, _) in found.iter().filter(|f| f.0 != stray.0) {
+            moments.add(positions[*rank as usize] - p);
+        }
+        fit = moments.plane();
+    }
     Tangent {
         normal: fit.normal.as_vec3().to_array(),
         height_mm: -fit.normal.dot(fit.centre) as f32,
         variance_mm2: fit.variances[2] as f32,
         reach_mm: found.last().map_or(0.0, |f| f.1.sqrt()) as f32,
-        count: found.len() as u32,
+        count: moments.count() as u32,
     }
 }
