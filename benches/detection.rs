@@ -1,6 +1,7 @@
 //! Sharp edges: our scores on exact clouds beside the goal and the best others reach with a threshold tuned per cloud.
 //!
-//! `cargo bench --bench detection [-- NAME]` runs all clouds, or those whose name contains NAME.
+//! `cargo bench --bench detection [-- NAME]` runs all clouds, or those whose name contains NAME; `-- speed` times the detector beside
+//! our own search for the 20 nearest neighbours of the same points, in turn.
 
 #![allow(clippy::print_stdout)]
 
@@ -8,6 +9,7 @@ use acies::features::{Class, Method, detect};
 use acies::points::Neighbors;
 use acies::points::picture::{self, ViewDirection, render};
 use glam::DVec3;
+use rayon::prelude::*;
 
 #[path = "../tests/clouds/mod.rs"]
 mod clouds;
@@ -177,11 +179,91 @@ fn colour(class: &Class) -> [u8; 3] {
     }
 }
 
+/// Seconds of `work`.
+fn seconds(work: impl FnOnce()) -> f64 {
+    let start = std::time::Instant::now();
+    work();
+    start.elapsed().as_secs_f64()
+}
+
+/// The middle of `values`.
+fn median(mut values: Vec<f64>) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[values.len() / 2]
+}
+
+/// Resident memory now and at its highest since the last call, bytes; zero where the system does not tell.
+fn memory() -> (f64, f64) {
+    let text = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let bytes = |key: &str| {
+        let line = text.lines().find(|l| l.starts_with(key));
+        let number = line.and_then(|l| l.split_whitespace().nth(1)?.parse::<f64>().ok());
+        number.unwrap_or(0.0) * 1024.0
+    };
+    let seen = (bytes("VmRSS:"), bytes("VmHWM:"));
+    // Five resets the high-water mark (proc(5)).
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
+    seen
+}
+
+/// Time and memory on the block, as ratios to the neighbour search.
+fn speed() {
+    println!(
+        "{:>9} {:>7} {:>9} {:>8} {:>6} {:>13}",
+        "points", "threads", "search s", "detect s", "ratio", "bytes a point"
+    );
+    for count in [500_000, 2_000_000] {
+        let cloud = cloud(&solids::block().sample(count, 0.1, 1).points);
+        let neighbors = Neighbors::new(&cloud.positions);
+        for threads in [1, 2] {
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+            let Ok(pool) = pool else { continue };
+            let (mut searches, mut detections, mut ratios) = (vec![], vec![], vec![]);
+            let mut bytes = 0.0;
+            for _ in 0..3 {
+                let search = pool.install(|| {
+                    seconds(|| {
+                        let order = neighbors.order();
+                        let far: f64 = order
+                            .par_iter()
+                            .map_init(Vec::new, |found, i| {
+                                neighbors.nearest(cloud.positions[*i as usize], 20, found);
+                                found[found.len() - 1].1
+                            })
+                            .sum();
+                        assert!(far > 0.0, "neighbours are apart");
+                    })
+                });
+                let (before, _) = memory();
+                let found = pool.install(|| {
+                    seconds(|| {
+                        let found = detect(&cloud, &neighbors, Method::Adaptive);
+                        assert!(found.count(Class::Edge) > 0, "the block has edges");
+                    })
+                });
+                bytes = (memory().1 - before) / count as f64;
+                searches.push(search);
+                detections.push(found);
+                ratios.push(found / search);
+            }
+            println!(
+                "{count:9} {threads:7} {:9.2} {:8.2} {:6.2} {bytes:13.0}",
+                median(searches),
+                median(detections),
+                median(ratios)
+            );
+        }
+    }
+}
+
 fn main() {
     let wanted: Vec<String> = std::env::args()
         .skip(1)
         .filter(|a| !a.starts_with("--"))
         .collect();
+    if wanted.iter().any(|w| w == "speed") {
+        return speed();
+    }
     println!(
         "{:26} {:>8} {:>6} {:>6} {:>6} {:>6} {:>6} {:>7} {:>7} {:>6}",
         "cloud", "points", "goal", "F1", "prec", "recall", "oracle", "s est", "noise/s", "time"
