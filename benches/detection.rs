@@ -1,7 +1,7 @@
 //! Sharp edges: our scores on exact clouds beside the goal and the best others reach with a threshold tuned per cloud.
 //!
-//! `cargo bench --bench detection [-- NAME]` runs all clouds, or those whose name contains NAME; `-- speed` times the detector beside
-//! our own search for the 20 nearest neighbours of the same points, in turn.
+//! `cargo bench --bench detection [-- NAME]` runs all clouds, or those whose name contains NAME; `-- speed [MOST]` times the
+//! detector beside our own search for the 20 nearest neighbours of the same points, in turn, for clouds of at most MOST points.
 
 #![allow(clippy::print_stdout)]
 
@@ -207,12 +207,17 @@ fn memory() -> (f64, f64) {
 }
 
 /// Time and memory on the block, as ratios to the neighbour search.
-fn speed() {
+fn speed(most: Option<usize>) {
     println!(
         "{:>9} {:>7} {:>9} {:>8} {:>6} {:>13}",
         "points", "threads", "search s", "detect s", "ratio", "bytes a point"
     );
     for count in [500_000, 2_000_000] {
+        if let Some(most) = most
+            && count > most
+        {
+            continue;
+        }
         let cloud = cloud(&solids::block().sample(count, 0.1, 1).points);
         let neighbors = Neighbors::new(&cloud.positions);
         for threads in [1, 2] {
@@ -262,7 +267,7 @@ fn main() {
         .filter(|a| !a.starts_with("--"))
         .collect();
     if wanted.iter().any(|w| w == "speed") {
-        return speed();
+        return speed(wanted.iter().find_map(|w| w.parse().ok()));
     }
     println!(
         "{:26} {:>8} {:>6} {:>6} {:>6} {:>6} {:>6} {:>7} {:>7} {:>6}",

@@ -19,7 +19,7 @@ const MODEL_ERROR: f64 = 0.017;
 /// A point is marked when the edge passes within this many spacings.
 pub(super) const THIN: f64 = 0.97;
 const FAINT: f64 = 0.35;
-const CURVATURE_SD: f64 = 2.0;
+const SURE: f64 = 4.0;
 /// Share of the neighbours that must see an edge for it to be believed.
 const AGREEMENT: f64 = 0.45;
 
@@ -105,28 +105,31 @@ impl Places<'_> {
         if !self.is_flat(tangents, rank) {
             return true;
         }
-        // A normal over n points within radius r is good to 2 sigma / (r sqrt n) about either axis, and its slope over such a
-        // neighbourhood, in which about four normals are independent, to that over r.
+        // A normal over n points within radius r is good to 2 sigma / (r sqrt n) about either axis, and of the normals within such a
+        // neighbourhood about four are independent. Where a neighbour's plane is none, a sharp edge is near that one, not this.
+        let flat = |j: usize| self.is_flat(tangents, j);
+        let Some((bend, spread)) = tangents.curvature(&self.positions, rank, flat) else {
+            return false;
+        };
         let unit = self.unit_mm(f64::from(plane.reach_mm), plane.count as usize);
         let reach = f64::from(plane.reach_mm) / unit;
-        let sd = CURVATURE_SD * (self.variance(unit) / f64::from(plane.count)).sqrt() / (reach * reach);
-        // Where a neighbour's plane is none, a sharp edge is near that one, not this.
-        let flat = |j: usize| self.is_flat(tangents, j);
-        let bend = tangents.curvature(&self.positions, rank, flat) * unit;
-        bend > 3.5 * sd && bend * 2.0 * reach > LEAST_TURN
+        let sd = (self.variance(unit) / spread).sqrt() * unit / reach;
+        bend * unit > SURE * sd && bend * unit * 2.0 * reach > LEAST_TURN
     }
 
     /// What is seen from the candidate `rank`, by growing its neighbourhood until the answer is clear.
     pub fn look(&self, tangents: &Tangents, rank: usize, shop: &mut Bench) -> Option<Sight> {
         let p = self.positions[rank];
-        for level in LEVELS {
-            self.neighbors.nearest_places(p, level, &mut shop.found);
+        // What is flat within noise hides only what more points than that show.
+        shop.flanks.was_smooth = self.is_flat(tangents, rank);
+        for level in &LEVELS[usize::from(shop.flanks.was_smooth)..] {
+            self.neighbors.nearest_places(p, *level, &mut shop.found);
             drop_ties(&mut shop.found);
             let reach = shop.found.last().map_or(0.0, |f| f.1.sqrt());
             let unit = self.unit_mm(reach, shop.found.len());
             self.fill(tangents, p, unit, shop);
             let variance = self.variance(unit);
-            match shop.flanks.analyse(variance, level < LEVELS[2]) {
+            match shop.flanks.analyse(variance) {
                 Verdict::Smooth => return None,
                 Verdict::Creased(crease) => {
                     let stays = !self.goes_on(tangents, (p, unit), &crease, shop);
@@ -141,7 +144,13 @@ impl Places<'_> {
     /// Whether a faint crease is but the first step of a surface that goes on turning: where a fillet, or the facets of one, begins.
     ///
     /// The tangent planes from three to six spacings beside the crease have turned farther from the flank than the crease turns.
-    fn goes_on(&self, tangents: &Tangents, (p, unit): (DVec3, f64), crease: &Crease, shop: &mut Bench) -> bool {
+    fn goes_on(
+        &self,
+        tangents: &Tangents,
+        (p, unit): (DVec3, f64),
+        crease: &Crease,
+        shop: &mut Bench,
+    ) -> bool {
         if crease.turn > FAINT {
             return false;
         }
@@ -242,9 +251,7 @@ impl Places<'_> {
             }
         }
         let mut agreed = best?;
-        agreed.corner_distance = self
-            .corner(around, sights, (p, unit))
-            .map(|d| d / thin);
+        agreed.corner_distance = self.corner(around, sights, (p, unit)).map(|d| d / thin);
         Some(agreed)
     }
 

@@ -61,6 +61,9 @@ pub(super) struct Workshop {
     pub points: Vec<DVec3>,
     /// Plausible planes from outside.
     pub seeds: Vec<Plane>,
+    /// Whether one smooth surface has explained a smaller neighbourhood of the same point: what more a larger one is made of does not
+    /// matter then.
+    pub was_smooth: bool,
     costs: Vec<f64>,
     labels: Vec<u8>,
     near: Vec<(f64, u32)>,
@@ -71,7 +74,7 @@ pub(super) struct Workshop {
 impl Workshop {
     /// What the neighbourhood in `points` is, at noise of variance `variance` (spacings squared).
     ///
-    pub fn analyse(&mut self, variance: f64, many: bool) -> Verdict {
+    pub fn analyse(&mut self, variance: f64) -> Verdict {
         if self.points.len() < 8 {
             return Verdict::Smooth;
         }
@@ -85,10 +88,9 @@ impl Workshop {
             return verdict;
         }
         let n = self.points.len() as f64;
-        if !whole.surface.is_curved() && whole.squares < variance * (n + 4.0 * (2.0 * n).sqrt()) {
-            return Verdict::Unsure;
-        }
-        if !many {
+        let plain =
+            !whole.surface.is_curved() && whole.squares < variance * (n + 4.0 * (2.0 * n).sqrt());
+        if plain || self.was_smooth {
             return Verdict::Unsure;
         }
         let all = Plane::through(self.points.iter().copied());
@@ -104,7 +106,7 @@ impl Workshop {
     }
 
     /// The verdict where one smooth surface explains all points so well that no crease could be decisive.
-    fn at_a_glance(&self, whole: &Fit, variance: f64) -> Option<Verdict> {
+    fn at_a_glance(&mut self, whole: &Fit, variance: f64) -> Option<Verdict> {
         let n = self.points.len();
         let expected = (n - whole.parameters.min(n)) as f64;
         // A crease of turn a within the radius r bends the best quadric by 4.07 tan(a / 2) / r.
@@ -123,6 +125,7 @@ impl Workshop {
         if whole.squares > variance * (expected + 0.5 * DECISIVE) {
             return None;
         }
+        self.was_smooth = true;
         let least = (0.5 * LEAST_TURN).tan();
         Some(if due(least) > CLEAR && half_turn < 0.7 * least {
             Verdict::Smooth
@@ -172,7 +175,12 @@ impl Workshop {
         first.clear();
         second.clear();
         for (p, label) in self.points.iter().zip(&self.labels) {
-            if *label == 0 { &mut *first } else { &mut *second }.push(*p);
+            if *label == 0 {
+                &mut *first
+            } else {
+                &mut *second
+            }
+            .push(*p);
         }
         let fits = [(0, fit(first, variance)?), (1, fit(second, variance)?)];
         let parts = self.split(&fits[0], &fits[1], variance)?;
@@ -350,12 +358,7 @@ impl Workshop {
     /// The two surfaces fitted anew after giving each of their points, which are left in `whole`, to the side of the crease on which it lies.
     ///
     /// The side is that of the surface which halves the angle: unlike the nearer of the two, it does not select by noise.
-    fn split(
-        &mut self,
-        one: &(u8, Fit),
-        other: &(u8, Fit),
-        variance: f64,
-    ) -> Option<[Fit; 2]> {
+    fn split(&mut self, one: &(u8, Fit), other: &(u8, Fit), variance: f64) -> Option<[Fit; 2]> {
         let mut fits = [one.1, other.1];
         let labelled = self.points.iter().zip(&self.labels);
         self.whole.clear();
@@ -535,7 +538,10 @@ impl Workshop {
             let labelled = self.points.iter().zip(&self.labels);
             labelled.filter(|(p, l)| near(p) && !labels.contains(l))
         };
-        creased += 9.0 * others().filter(|(_, l)| all.iter().all(|f| f.0 != **l)).count() as f64;
+        creased += 9.0
+            * others()
+                .filter(|(_, l)| all.iter().all(|f| f.0 != **l))
+                .count() as f64;
         for (label, fit) in all {
             let mut count = 0;
             for (p, _) in others().filter(|(_, l)| *l == label) {
@@ -549,9 +555,14 @@ impl Workshop {
         let Some(whole) = fit(&self.whole, variance) else {
             return None;
         };
-        let smooth = varying(&whole.surface, &self.whole, variance)
-            .unwrap_or(f64::INFINITY)
-            .min(whole.criterion(variance));
+        // A surface of fourth degree follows a crease so far that a quarter of the squares remain.
+        let smooth = if due > 8.0 * CLEAR {
+            whole.criterion(variance)
+        } else {
+            varying(&whole.surface, &self.whole, variance)
+                .unwrap_or(f64::INFINITY)
+                .min(whole.criterion(variance))
+        };
         let evidence = smooth - creased;
         if evidence > (LOCAL * due).min(DECISIVE) {
             Some(true)

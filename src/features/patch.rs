@@ -111,7 +111,11 @@ impl Surface {
         let angle = 0.5 * (2.0 * xy).atan2(xx - yy);
         let along = |a: f64| self.frame[0] * a.cos() + self.frame[1] * a.sin();
         // The angle is that of the larger, not of the stronger curvature.
-        let strong = if xx + yy < 0.0 { angle + 0.5 * std::f64::consts::PI } else { angle };
+        let strong = if xx + yy < 0.0 {
+            angle + 0.5 * std::f64::consts::PI
+        } else {
+            angle
+        };
         self.is_curved().then(|| along(strong))
     }
 
@@ -185,7 +189,11 @@ pub(super) fn varying(under: &Surface, points: &[DVec3], variance: f64) -> Optio
     if count < 2 * TERMS {
         return None;
     }
-    let reach = points.iter().map(|p| under.local(*p)).fold(0.0, |r: f64, [x, y, _]| r.max(x * x + y * y)).sqrt();
+    let reach = points
+        .iter()
+        .map(|p| under.local(*p))
+        .fold(0.0, |r: f64, [x, y, _]| r.max(x * x + y * y))
+        .sqrt();
     let row = |p: DVec3| {
         let [x, y, z] = under.local(p).map(|c| c / reach);
         let (x2, y2) = (x * x, y * y);
@@ -194,7 +202,21 @@ pub(super) fn varying(under: &Surface, points: &[DVec3], variance: f64) -> Optio
         let hy = c[2] + reach * (c[4] * x + 2.0 * c[5] * y);
         (
             [
-                1.0, x, y, x2, x * y, y2, x2 * x, x2 * y, x * y2, y2 * y, x2 * x2, x2 * x * y, x2 * y2, x * y * y2, y2 * y2,
+                1.0,
+                x,
+                y,
+                x2,
+                x * y,
+                y2,
+                x2 * x,
+                x2 * y,
+                x * y2,
+                y2 * y,
+                x2 * x2,
+                x2 * x * y,
+                x2 * y2,
+                x * y * y2,
+                y2 * y2,
             ],
             z,
             1.0 / (1.0 + hx * hx + hy * hy),

@@ -65,13 +65,14 @@ impl Tangents {
         &list[..len]
     }
 
-    /// Largest curvature at a place, 1/mm: how the normals of those neighbours that are `flat` change with the way to them.
+    /// Largest curvature at a place, 1/mm: how the normals of those neighbours that are `flat` change with the way to them; and the sum of
+    /// the squares of the way in the direction in which it is least, mm².
     pub fn curvature(
         &self,
         positions: &[DVec3],
         rank: usize,
         flat: impl Fn(usize) -> bool,
-    ) -> f64 {
+    ) -> Option<(f64, f64)> {
         let n = self.planes[rank].normal();
         let u = n.any_orthonormal_vector();
         let v = n.cross(u);
@@ -97,14 +98,16 @@ impl Tangents {
         }
         let det = xx * yy - xy * xy;
         if det.is_nan() || det <= 1e-6 * (xx + yy).powi(2) {
-            return f64::INFINITY;
+            return None;
         }
+        let least = 0.5 * (xx + yy) - (0.25 * (xx - yy) * (xx - yy) + xy * xy).sqrt();
         let p = (change[0][0] * yy - change[0][1] * xy) / det;
         let s = (change[1][1] * xx - change[1][0] * xy) / det;
         let q = (change[0][1] * xx - change[0][0] * xy) / det;
         let r = (change[1][0] * yy - change[1][1] * xy) / det;
         let mixed = 0.5 * (q + r);
-        0.5 * (p + s).abs() + (0.25 * (p - s) * (p - s) + mixed * mixed).sqrt()
+        let bend = 0.5 * (p + s).abs() + (0.25 * (p - s) * (p - s) + mixed * mixed).sqrt();
+        Some((bend, least))
     }
 }
 
