@@ -9,8 +9,10 @@ use crate::points::{Neighbors, PointCloud, Spacing, noise_mm, spacing};
 
 mod adaptive;
 mod boundary;
+mod cone;
 mod curves;
 mod flanks;
+mod lattice;
 mod lines;
 mod patch;
 pub mod profile;
@@ -30,7 +32,7 @@ pub enum Class {
     None = 0,
     /// Within about one spacing of an edge between two surfaces.
     Edge = 1,
-    /// Within about one spacing of a place where three or more surfaces meet.
+    /// Within about one spacing of a place where three or more surfaces meet, or of the tip of a cone.
     Corner = 2,
     /// On the border of the data: an open edge or an occlusion.
     Boundary = 3,
@@ -116,14 +118,25 @@ fn adaptive(
         .iter()
         .map(|i| cloud.positions[*i as usize])
         .collect();
-    let classes = if detection.spacing.in_lines() {
-        in_lines(&all, neighbors, detection, clock)
+    let lattice = lattice::places(cloud, detection.noise_mm);
+    let classes = if detection.spacing.in_lines() || lattice.is_some() {
+        let stray = |rank: usize| {
+            let at = |i: &u32| lattice.as_ref().map(|l| l[*i as usize]);
+            let points = neighbors.points_at(rank);
+            points.iter().all(|i| at(i) == Some(lattice::Place::Stray))
+        };
+        in_lines(&all, (neighbors, &stray), detection, clock)
     } else {
         evenly(all, neighbors, detection, clock)
     };
     for (rank, class) in classes.iter().enumerate() {
         for i in neighbors.points_at(rank) {
-            detection.classes[*i as usize] = *class;
+            let place = lattice.as_ref().map(|l| l[*i as usize]);
+            detection.classes[*i as usize] = match (class, place) {
+                (_, Some(lattice::Place::Stray)) => Class::None,
+                (Class::None, Some(lattice::Place::Border)) => Class::Boundary,
+                _ => *class,
+            };
         }
     }
 }
@@ -157,20 +170,23 @@ fn evenly(
         })
         .collect();
     clock.lap("agreement");
-    let classes = boundary::mark(&places, &tangents, edges);
+    let mut classes = boundary::mark(&places, &tangents, edges);
     clock.lap("boundaries");
+    mark_tips(&sights.tips, (neighbors, places.thin_mm), &mut classes);
     classes
 }
 
 /// The classes of places in scan lines: looked for on places picked out of them as densely along as across, then told to all.
+///
+/// Places that are `stray` bear no witness.
 fn in_lines(
     all: &[DVec3],
-    neighbors: &Neighbors,
+    (neighbors, stray): (&Neighbors, &dyn Fn(usize) -> bool),
     detection: &Detection,
     clock: &mut Clock,
 ) -> Vec<Class> {
     let across_mm = detection.spacing.across_mm;
-    let picked = lines::pick(all, neighbors, lines::PICKED * across_mm);
+    let picked = lines::pick(all, neighbors, (lines::PICKED * across_mm, stray));
     let few = Neighbors::new(&picked);
     let positions: Vec<DVec3> = few.places().iter().map(|i| picked[*i as usize]).collect();
     clock.lap("picking");
@@ -191,9 +207,22 @@ fn in_lines(
         vec![Class::None; places.positions.len()],
     );
     clock.lap("boundaries");
-    let classes = all
+    let sighted: Vec<bool> = (0..places.positions.len())
+        .into_par_iter()
+        .map(|rank| {
+            let around = tangents.around(rank);
+            around.iter().any(|j| sights.at(*j as usize).is_some())
+        })
+        .collect();
+    let mut classes: Vec<Class> = all
         .par_iter()
         .map_init(Vec::new, |found, p| {
+            few.nearest_places(*p, 1, found);
+            if let Some((nearest, _)) = found.first()
+                && !sighted[*nearest as usize]
+            {
+                return borders[*nearest as usize];
+            }
             few.nearest_places(*p, tangent::NEAR, found);
             let mut around = [0; tangent::NEAR];
             for (slot, (rank, _)) in around.iter_mut().zip(found.iter()) {
@@ -209,7 +238,19 @@ fn in_lines(
         })
         .collect();
     clock.lap("agreement");
+    mark_tips(&sights.tips, (neighbors, places.thin_mm), &mut classes);
     classes
+}
+
+/// Makes corners of the places within `thin_mm` of the `tips` (mm) of cones.
+fn mark_tips(tips: &[DVec3], (neighbors, thin_mm): (&Neighbors, f64), classes: &mut [Class]) {
+    let mut found = Vec::new();
+    for tip in tips {
+        neighbors.within_places(*tip, thin_mm, &mut found);
+        for (rank, _) in &found {
+            classes[*rank as usize] = Class::Corner;
+        }
+    }
 }
 
 struct Clock {

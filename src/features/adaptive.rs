@@ -7,6 +7,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::Class;
+use super::cone::Cone;
 use super::flanks::{Crease, LEAST_TURN, Verdict, Workshop};
 use super::patch::Plane;
 use super::tangent::{Tangents, drop_ties};
@@ -18,6 +19,8 @@ const LEVELS: [usize; 3] = [40, 100, 220];
 const MODEL_ERROR: f64 = 0.017;
 /// A point is marked when the edge passes within this many spacings.
 pub(super) const THIN: f64 = 0.97;
+/// Farthest tip of a cone, in spacings, of which a place bears witness.
+const TIP_REACH: f64 = 4.0;
 const FAINT: f64 = 0.35;
 const SURE: f64 = 4.0;
 /// Share of the neighbours that must see an edge for it to be believed.
@@ -44,6 +47,14 @@ pub(super) struct Sight {
     pub tangent: DVec3,
     pub sd_mm: f64,
     pub corner: Option<DVec3>,
+}
+
+/// What is seen from a place.
+pub(super) enum Seen {
+    /// An edge.
+    Edge(Sight),
+    /// The tip of a cone, at these coordinates, mm.
+    Tip(DVec3),
 }
 
 /// An edge that several neighbourhoods agree upon, as seen from one place.
@@ -118,7 +129,7 @@ impl Places<'_> {
     }
 
     /// What is seen from the candidate `rank`, by growing its neighbourhood until the answer is clear.
-    pub fn look(&self, tangents: &Tangents, rank: usize, shop: &mut Bench) -> Option<Sight> {
+    pub fn look(&self, tangents: &Tangents, rank: usize, shop: &mut Bench) -> Option<Seen> {
         let p = self.positions[rank];
         // What is flat within noise hides only what more points than that show.
         shop.flanks.was_smooth = self.is_flat(tangents, rank);
@@ -132,8 +143,16 @@ impl Places<'_> {
             match shop.flanks.analyse(variance) {
                 Verdict::Smooth => return None,
                 Verdict::Creased(crease) => {
+                    let flanks = &shop.flanks;
+                    let cone = Cone::through(&flanks.points, &flanks.seeds, variance);
+                    if let Some((cone, criterion)) = cone
+                        && criterion < crease.criterion
+                    {
+                        let near = cone.tip.length() < TIP_REACH;
+                        return near.then(|| Seen::Tip(p + cone.tip * unit));
+                    }
                     let stays = !self.goes_on(tangents, (p, unit), &crease, shop);
-                    return stays.then(|| in_mm(crease, unit));
+                    return stays.then(|| Seen::Edge(in_mm(crease, unit)));
                 }
                 Verdict::Unsure => {}
             }
@@ -334,11 +353,36 @@ pub(super) struct Sights {
     /// Index into `seen` by rank, or `u32::MAX`.
     index: Vec<u32>,
     seen: Vec<Sight>,
+    /// Tips of cones that several places see, mm.
+    pub tips: Vec<DVec3>,
+}
+
+/// The means of those `tips` (mm) that lie together.
+fn agreed_tips(tips: &[DVec3], spacing_mm: f64) -> Vec<DVec3> {
+    const WITNESSES: usize = 4;
+    let neighbors = Neighbors::new(tips);
+    let mut taken = vec![false; tips.len()];
+    let mut agreed = Vec::new();
+    let mut found = Vec::new();
+    for &i in neighbors.order() {
+        if taken[i as usize] {
+            continue;
+        }
+        neighbors.within(tips[i as usize], spacing_mm, &mut found);
+        found.retain(|f| !taken[f.0 as usize]);
+        if found.len() < WITNESSES {
+            continue;
+        }
+        let sum: DVec3 = found.iter().map(|f| tips[f.0 as usize]).sum();
+        found.iter().for_each(|f| taken[f.0 as usize] = true);
+        agreed.push(sum / found.len() as f64);
+    }
+    agreed
 }
 
 impl Sights {
     pub fn new(places: &Places, tangents: &Tangents) -> Self {
-        let all: Vec<(u32, Sight)> = (0..places.positions.len())
+        let all: Vec<(u32, Seen)> = (0..places.positions.len())
             .into_par_iter()
             .map_init(Bench::default, |bench, rank| {
                 if !places.is_candidate(tangents, rank) {
@@ -350,11 +394,21 @@ impl Sights {
             .collect();
         let mut index = vec![u32::MAX; places.positions.len()];
         let mut seen = Vec::with_capacity(all.len());
+        let mut tips = Vec::new();
         for (rank, sight) in all {
-            index[rank as usize] = seen.len() as u32;
-            seen.push(sight);
+            match sight {
+                Seen::Edge(sight) => {
+                    index[rank as usize] = seen.len() as u32;
+                    seen.push(sight);
+                }
+                Seen::Tip(tip) => tips.push(tip),
+            }
         }
-        Self { index, seen }
+        Self {
+            index,
+            seen,
+            tips: agreed_tips(&tips, places.spacing_mm),
+        }
     }
 
     pub fn at(&self, rank: usize) -> Option<&Sight> {

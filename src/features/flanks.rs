@@ -39,6 +39,8 @@ pub(super) struct Crease {
     pub into: [DVec3; 2],
     /// Standard deviation of the foot across the edge.
     pub sd: f64,
+    /// Bayes' criterion of all surfaces that the neighbourhood is split into.
+    pub criterion: f64,
     /// Where three or more surfaces meet nearby.
     pub corner: Option<DVec3>,
 }
@@ -489,12 +491,23 @@ impl Workshop {
                 tangent,
                 turn,
                 into: across,
+                criterion: self.criterion(all, labels, &fits, variance),
                 sd: (variance * place).sqrt() / turn.sin(),
                 corner: None,
             }),
             Some(false) => Verdict::Smooth,
             None => Verdict::Unsure,
         }
+    }
+
+    /// Bayes' criterion of all surfaces, the two of `labels` as in `fits`.
+    fn criterion(&self, all: &[(u8, Fit)], labels: [u8; 2], fits: &[Fit; 2], variance: f64) -> f64 {
+        let others = all.iter().filter(|f| !labels.contains(&f.0));
+        let explained = fits.iter().chain(others.map(|f| &f.1));
+        let (sum, count) = explained.fold((0.0, 0), |(sum, count), f| {
+            (sum + f.criterion(variance), count + f.count)
+        });
+        sum + 9.0 * self.points.len().saturating_sub(count) as f64
     }
 
     /// Whether the crease last split shows near its foot `e` too, as strongly as its `turn` (rad) must there.

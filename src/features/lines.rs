@@ -10,13 +10,17 @@ use crate::points::Neighbors;
 pub(super) const PICKED: f64 = 0.55;
 
 /// Places of `all` (mm; `neighbors` ranks them in this order) no two of which are nearer than `apart_mm`, and none of which lies farther
-/// than that from all of them.
-pub(super) fn pick(all: &[DVec3], neighbors: &Neighbors, apart_mm: f64) -> Vec<DVec3> {
+/// than that from all of them; those that are `stray` aside.
+pub(super) fn pick(
+    all: &[DVec3],
+    neighbors: &Neighbors,
+    (apart_mm, stray): (f64, &dyn Fn(usize) -> bool),
+) -> Vec<DVec3> {
     let mut covered = vec![false; all.len()];
     let mut picked = Vec::new();
     let mut found = Vec::new();
     for (rank, p) in all.iter().enumerate() {
-        if covered[rank] {
+        if covered[rank] || stray(rank) {
             continue;
         }
         picked.push(*p);

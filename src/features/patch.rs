@@ -273,7 +273,7 @@ fn bend(start: &Surface, points: &[DVec3]) -> Option<Surface> {
 }
 
 /// Solves the symmetric system whose upper triangle is `a`; `None` where it is singular.
-fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
+pub(super) fn solve<const N: usize>(mut a: [[f64; N]; N], mut b: [f64; N]) -> Option<[f64; N]> {
     let scale = (0..N).map(|i| a[i][i]).fold(0.0, f64::max);
     for k in 0..N {
         let pivot = a[k][k];

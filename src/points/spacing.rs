@@ -6,7 +6,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::moments::Moments;
-use super::{Neighbors, PointCloud};
+use super::{Neighbors, Origin, PointCloud};
 
 /// Places looked at; the medians over them are good to a few percent.
 const SAMPLES: usize = 3_000;
@@ -42,7 +42,7 @@ impl Spacing {
 
 /// The spacing of `cloud`; all zero where it has fewer than three distinct points.
 ///
-/// Medians over a sample of places. Across the lines counts the radius within which a place has neighbours in every direction of
+/// From the lattice where there is one; else medians over a sample of places. Across the lines counts the radius within which a place has neighbours in every direction of
 /// its tangent plane; that holds for lattices, merged views and unorganised points alike.
 pub fn spacing(cloud: &PointCloud, neighbors: &Neighbors) -> Spacing {
     let samples: Vec<[f64; 3]> = sample(neighbors.places())
@@ -51,6 +51,13 @@ pub fn spacing(cloud: &PointCloud, neighbors: &Neighbors) -> Spacing {
         .collect();
     let middle = |at: usize| quantile(samples.iter().map(|s| s[at]).collect(), 0.5);
     let (mean, along) = (middle(0), middle(1));
+    if let Some((along, across)) = lattice_spacing(cloud) {
+        return Spacing {
+            along_mm: along.min(across),
+            across_mm: along.max(across),
+            mean_mm: mean,
+        };
+    }
     let lined: Vec<f64> = samples
         .iter()
         .filter(|s| s[2] > LINES_FROM * s[1])
@@ -70,6 +77,28 @@ pub fn spacing(cloud: &PointCloud, neighbors: &Neighbors) -> Spacing {
             mean_mm: mean,
         }
     }
+}
+
+/// Median distance from column to column and from profile to profile, mm, where the cloud has a lattice.
+fn lattice_spacing(cloud: &PointCloud) -> Option<(f64, f64)> {
+    if cloud.origins.is_empty() || cloud.check_lattice().is_err() {
+        return None;
+    }
+    let mut order: Vec<u32> = (0..cloud.len() as u32).collect();
+    let mut median_step = |key: &(dyn Fn(&Origin) -> (u16, u32, u32) + Sync)| {
+        order.par_sort_unstable_by_key(|i| (key(&cloud.origins[*i as usize]), *i));
+        let steps = order.windows(2).filter_map(|w| {
+            let [from, to] = [w[0], w[1]].map(|i| key(&cloud.origins[i as usize]));
+            let next = (from.0, from.1) == (to.0, to.1) && to.2 > from.2;
+            let [a, b] = [w[0], w[1]].map(|i| cloud.positions[i as usize]);
+            next.then(|| a.distance(b))
+        });
+        let steps: Vec<f64> = steps.filter(|d| *d > 0.0 && d.is_finite()).collect();
+        (!steps.is_empty()).then(|| quantile(steps, 0.5))
+    };
+    let along = median_step(&|o| (o.view, o.profile, u32::from(o.column)))?;
+    let across = median_step(&|o| (o.view, u32::from(o.column), o.profile))?;
+    Some((along, across))
 }
 
 /// Mean spacing, distance to the second nearest neighbour, and radius that has neighbours all around.
