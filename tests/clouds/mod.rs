@@ -10,6 +10,7 @@ use glam::{DVec2, DVec3};
 
 pub mod score;
 pub mod solids;
+pub mod thesis;
 
 /// A generator of reproducible numbers (splitmix64).
 pub struct Random(u64);
