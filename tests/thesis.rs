@@ -1,46 +1,176 @@
-//! exploration
-mod clouds;
-use acies::features::{thesis, Method, detect};
+//! The methods of Weber's thesis on its own examples: Table 1 comes out, and nothing but the points' places decides the answer.
+//!
+//! `cargo bench --bench thesis` prints all of its tables and figures; here are those that ours must not lose.
+
+use acies::features::{Class, thesis, variation};
 use acies::points::Neighbors;
-use clouds::score::cloud;
-use clouds::thesis::*;
+use glam::DVec3;
+
+mod clouds;
+
+use clouds::score::{cloud, score_classes};
+use clouds::thesis::{FIGURE_25, figures, hole_of_table_2, planes, table_1, wedge};
+use clouds::{Sampled, solids};
+
+fn found(points: &[DVec3], settings: &thesis::Settings) -> Vec<Class> {
+    let cloud = cloud(points);
+    thesis::detect_as_in_thesis(&cloud, &Neighbors::new(&cloud.positions), settings)
+}
+
+fn local(points: &[DVec3]) -> Vec<Class> {
+    found(points, &thesis::Settings::local_adaptive())
+}
+
 #[test]
-fn explore() {
-    for e in table_1() {
-        let c = cloud(&e.sampled.points);
-        let n = Neighbors::new(&c.positions);
-        assert_eq!(e.sampled.on_edge.iter().filter(|o| **o).count() > 0, true);
-        println!("{} {}", e.name, e.sampled.points.len());
-        for s in [thesis::Settings::global(), thesis::Settings{adaptation: None, ..thesis::Settings::local_adaptive()}, thesis::Settings::local_adaptive()] {
-            let t = std::time::Instant::now();
-            let f = figures(&e.sampled, &e.sampled, &thesis::detect_as_in_thesis(&c, &n, &s));
-            println!("   {:?} out {} mean {:.3} max {:.3}  {:.2}s", (f.detected,f.hits,f.features), f.outliers(), f.mean, f.largest, t.elapsed().as_secs_f64());
+fn the_clouds_have_the_numbers_of_the_thesis() {
+    let clouds = table_1().map(|example| example.sampled);
+    let expected = [(10_250, 580), (6_090, 256), (58_720, 1_350), (17_400, 839)];
+    for (sampled, (count, on_edge)) in clouds.iter().chain([&hole_of_table_2()]).zip(expected) {
+        assert_eq!(sampled.points.len(), count);
+        assert_eq!(sampled.on_edge.iter().filter(|o| **o).count(), on_edge);
+        for (p, on_edge) in sampled.points.iter().zip(&sampled.on_edge) {
+            let distance = clouds::score::distance(&sampled.edges, *p);
+            // Rows keep half a spacing away from edges; made on an edge is on it but for rounding.
+            if *on_edge {
+                assert!(distance < 1e-9 * count as f64);
+            } else {
+                assert!(distance > 0.45 * sampled.spacing, "{p}: {distance}");
+            }
         }
-        if false {let f = figures(&e.sampled, &e.sampled, &detect(&c,&n,Method::Adaptive).classes);
-        println!("a {f:?}"); }
     }
-    if std::env::var_os("T2").is_some() {
-    let exact = hole_of_table_2();
-    println!("{} {}", exact.points.len(), exact.spacing);
-    for scale in [0.5, 1.0] {
-    for (pc, a, b, n0) in TABLE_2 {
-        let sh = exact.clone().shaken(scale*pc/100.0*RADIUS, 5);
-        let c = cloud(&sh.points);
-        let n = Neighbors::new(&c.positions);
-        let s = thesis::Settings::local_adaptive();
-        let f = figures(&exact, &sh, &thesis::detect_as_in_thesis(&c, &n, &s));
-        let s = thesis::Settings::global();
-        let h = figures(&exact, &sh, &thesis::detect_as_in_thesis(&c, &n, &s));
-        let g = Figures::default();
-        println!("{pc} author {a} {b} {n0} | local {:.2} {:.3} {} out {} | glob {:.2} {:.3} {} out {}| adaptive {:.2} {:.3} {} out {}", f.largest, f.mean, f.detected, f.outliers(),h.largest, h.mean, h.detected, h.outliers(), g.largest, g.mean, g.detected, g.outliers());
+}
+
+#[test]
+fn the_angle_of_the_planes_runs_from_45_to_140_degrees() {
+    let sampled = planes(6_090, 256);
+    // The first and the last line across each strip: half a step from the ends, where the angle is within half a degree.
+    for (y, degrees) in [(0.5, 45.0), (255.5, 140.0)] {
+        let row = sampled.points.iter().filter(|p| (p.y - y).abs() < 0.4);
+        let arm = |up: bool| {
+            let mut side = row
+                .clone()
+                .filter(|p| if up { p.z > 0.1 } else { p.z < -0.1 });
+            let p = side.next().expect("points on both strips");
+            DVec3::new(p.x, 0.0, p.z)
+        };
+        let angle = arm(true).angle_between(arm(false)).to_degrees();
+        assert!((angle - degrees).abs() < 0.5, "{angle} {degrees}");
     }
+}
+
+#[test]
+fn table_1_comes_out() {
+    for example in table_1() {
+        let sampled = &example.sampled;
+        let found = figures(sampled, sampled, &local(&sampled.points));
+        // The thesis finds 99 percent of the cube and all of the others. It tells neither how its clouds were sampled nor how few points
+        // are a few: one percent either way is what the row that a point more or less comes to lie in does.
+        assert!(
+            found.hits as f64 >= 0.99 * found.features as f64,
+            "{}: {found:?}",
+            example.name
+        );
+        let off = found.detected.abs_diff(example.detected);
+        assert!(
+            off as f64 <= 0.01 * example.detected as f64,
+            "{}: {found:?}, the author detects {}",
+            example.name,
+            example.detected
+        );
     }
+}
+
+#[test]
+fn the_angles_of_figure_25_are_found_from_45_to_160_degrees() {
+    for degrees in FIGURE_25 {
+        let sampled = wedge(degrees);
+        let found = figures(&sampled, &sampled, &local(&sampled.points));
+        // The thesis: perfect above 45 degrees, not precise below, lost near 180, which ours are at 170.
+        if (45.0..=160.0).contains(&degrees) {
+            // The ends of the edge see half a neighbourhood.
+            assert!(
+                found.hits + 2 >= found.features && found.outliers() == 0,
+                "{degrees}: {found:?}"
+            );
+        }
     }
-    for d in FIGURE_25 {
-        let e = wedge(d);
-        let c = cloud(&e.points);
-        let n = Neighbors::new(&c.positions);
-        let f = figures(&e, &e, &thesis::detect_as_in_thesis(&c, &n, &thesis::Settings::local_adaptive()));
-            println!("{d}   {:?} out {} mean {:.3} max {:.3}", (f.detected,f.hits,f.features), f.outliers(), f.mean, f.largest);
+}
+
+#[test]
+fn the_global_method_finds_the_cube_with_ten_neighbours() {
+    // §3.7.3: k = 10 is best for the cube, and a sensitivity of 0.6 detects it perfectly.
+    let sampled = &table_1()[0].sampled;
+    let settings = thesis::Settings {
+        neighbours: 10,
+        ..thesis::Settings::global()
+    };
+    let found = figures(sampled, sampled, &found(&sampled.points, &settings));
+    assert!(
+        found.hits == found.features && found.outliers() == 0,
+        "{found:?}"
+    );
+}
+
+#[test]
+fn neither_the_order_of_the_points_nor_the_threads_change_the_answer() {
+    let sampled = solids::block().sample(6_000, 0.1, 9);
+    let classes = local(&sampled.points);
+    assert!(classes.contains(&Class::Edge));
+    let mut backwards: Vec<DVec3> = sampled.points.clone();
+    backwards.reverse();
+    let mut back = local(&backwards);
+    back.reverse();
+    assert_eq!(classes, back, "order");
+    for threads in [1, 3] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
+        let again = pool.expect("threads").install(|| local(&sampled.points));
+        assert_eq!(classes, again, "{threads} threads");
     }
+}
+
+#[test]
+fn a_candidate_with_one_fellow_or_none_is_an_outlier() {
+    // A plane with one point, and elsewhere two, pulled out of it by half a step.
+    let mut points: Vec<DVec3> = (0..900)
+        .map(|i| DVec3::new(f64::from(i % 30), f64::from(i / 30), 0.0))
+        .collect();
+    points[10 * 30 + 10].z = 0.5;
+    let classes = found(
+        &points,
+        &thesis::Settings {
+            adaptation: None,
+            ..thesis::Settings::local_adaptive()
+        },
+    );
+    let alone = classes.iter().filter(|c| **c == Class::Edge).count();
+    let thinned = local(&points).iter().filter(|c| **c == Class::Edge).count();
+    assert!(thinned == 0 || thinned < alone, "{alone} {thinned}");
+}
+
+#[test]
+fn nothing_too_few_and_identical_points_are_survived() {
+    for points in [
+        Vec::new(),
+        vec![DVec3::ONE; 50],
+        vec![DVec3::X, DVec3::Y, DVec3::NAN],
+    ] {
+        assert!(local(&points).iter().all(|c| *c == Class::None));
+        let cloud = cloud(&points);
+        let neighbors = Neighbors::new(&cloud.positions);
+        let classes =
+            variation::detect_by_variation(&cloud, &neighbors, &variation::Settings::default());
+        assert_eq!(classes.len(), points.len());
+    }
+}
+
+#[test]
+fn surface_variation_finds_right_edges_in_a_band() {
+    let sampled: Sampled = solids::cube(10.0).sample(10_000, 0.0, 3);
+    let cloud = cloud(&sampled.points);
+    let neighbors = Neighbors::new(&cloud.positions);
+    let classes =
+        variation::detect_by_variation(&cloud, &neighbors, &variation::Settings::default());
+    let score = score_classes(&sampled, &classes);
+    // Fig. 34: a band, whose middle is the edge.
+    assert!(score.recall > 0.5 && score.precision > 0.8, "{score:?}");
 }

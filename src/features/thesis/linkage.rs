@@ -306,7 +306,8 @@ mod tests {
 
     #[test]
     fn opposite_directions_are_one_line_and_two_bundles_two_clusters() {
-        let near = |d: DVec3, i: u32| (d + DVec3::new(0.01, -0.02, 0.015) * f64::from(i % 3)).normalize();
+        let near =
+            |d: DVec3, i: u32| (d + DVec3::new(0.01, -0.02, 0.015) * f64::from(i % 3)).normalize();
         let bundles: Vec<DVec3> = (0..30)
             .map(|i| match i % 4 {
                 0 => near(DVec3::X, i),
