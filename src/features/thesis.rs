@@ -493,4 +493,35 @@ mod tests {
         let last = steps[11];
         assert!(last.0 == 8 && (last.1 - 0.1 * 1.1f64.powi(12)).abs() < 1e-12);
     }
+
+    #[test]
+    fn lonely_candidates_go_and_crowded_ones_are_tested_again() {
+        let points: Vec<DVec3> = (0..1_600)
+            .map(|i| DVec3::new(f64::from(i % 40), f64::from(i / 40), 0.0))
+            .collect();
+        let cloud = PointCloud::from_positions(crate::points::Frame::Part, points);
+        let neighbors = Neighbors::new(&cloud.positions);
+        let hoods = Hoods {
+            cloud: &cloud,
+            neighbors: &neighbors,
+        };
+        // Three in a row, a pair, one alone; and a block of nine, which a plane does not have.
+        let three = [(5, 5), (6, 5), (7, 5)];
+        let mut named = vec![(5, 20), (6, 20), (20, 5)];
+        named.extend((0..9).map(|i| (20 + i % 3, 20 + i / 3)));
+        named.extend(three);
+        let is_named = |rank: &u32| {
+            let p = hoods.position(*rank);
+            named.contains(&(p.x as i32, p.y as i32))
+        };
+        let candidates: Vec<u32> = (0..1_600).filter(is_named).collect();
+        assert_eq!(candidates.len(), 15);
+        let settings = Settings::local_adaptive();
+        let kept = hoods.adapt(candidates, &settings, &settings.adaptation.unwrap());
+        let mut kept: Vec<(i32, i32)> = (kept.iter().map(|rank| hoods.position(*rank)))
+            .map(|p| (p.x as i32, p.y as i32))
+            .collect();
+        kept.sort_unstable();
+        assert_eq!(kept, three);
+    }
 }
