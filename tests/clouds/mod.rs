@@ -8,8 +8,10 @@ use std::f64::consts::TAU;
 
 use glam::{DVec2, DVec3};
 
+pub mod models;
 pub mod score;
 pub mod solids;
+pub mod thesis;
 
 /// A generator of reproducible numbers (splitmix64).
 pub struct Random(u64);
