@@ -22,7 +22,7 @@ pub(super) const THIN: f64 = 0.97;
 /// Farthest tip of a cone, in spacings, of which a place bears witness.
 const TIP_REACH: f64 = 4.0;
 const FAINT: f64 = 0.35;
-const SURE: f64 = 4.0;
+const SURE: f64 = 3.0;
 /// Share of the neighbours that must see an edge for it to be believed.
 const AGREEMENT: f64 = 0.45;
 
