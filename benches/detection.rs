@@ -48,6 +48,7 @@ fn views() -> Vec<DVec3> {
 fn rows() -> Vec<Row> {
     let mut rows = vec![
         row("cube", 0.995, || solids::cube(10.0).even(10_250, 580)),
+        row("planes", 0.995, || clouds::thesis::planes(6_090, 256)),
         row("hole58k", 0.995, || {
             solids::cube_with_hole(10.0).even(58_720, 1_350)
         }),

@@ -1,7 +1,18 @@
 //! The detector as users get it.
 //!
-//! Weber's idea is kept: near a sharp edge the Gauss map of a neighbourhood falls into clusters. We differ in what is mapped
-//! and how clusters are told apart: see [`super::Method::Adaptive`].
+//! Weber's idea is kept: near a sharp edge the Gauss map of a neighbourhood falls into clusters (Weber 2011, §3.4). We differ:
+//!
+//! - Clusters are surfaces, planes or quadrics, fitted to the points, not bundles of triangle normals, which noise spreads over the whole
+//!   sphere (§3.7.5). How many there are is settled by Bayes' criterion with the noise measured, not by a linkage distance.
+//! - The flatness test rejects what is a plane within noise and whose normals do not turn from neighbour to neighbour by more than chance.
+//! - An edge is where two surfaces meet between the points, not a point: no point need lie on it, and what is marked is what lies within
+//!   about one spacing.
+//! - A crease turns at once, a curved surface over a length. Every neighbourhood's answer is therefore checked in the smallest one that could
+//!   tell (see `flanks`), against a quadric, a surface of fourth degree and a cone; what is open is looked at with more points.
+//! - In scan lines all this is done on places picked out of them as densely along as across; where the lattice is known, depth jumps are
+//!   borders and mixed points bear no witness.
+//! - An edge counts when the neighbours that ought to see it do, so that no point is marked for what it alone has seen. The thesis thins
+//!   its candidates to a share of each neighbourhood instead (§3.6).
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -15,13 +26,18 @@ use crate::points::Neighbors;
 
 /// Points looked at around a candidate, one level after the other as long as the answer is open.
 const LEVELS: [usize; 3] = [40, 100, 220];
-/// Flanks are allowed to depart from a quadric by this many spacings beside the noise.
-const MODEL_ERROR: f64 = 0.017;
-/// A point is marked when the edge passes within this many spacings.
+/// Flanks are allowed to depart from a quadric by this many spacings beside the noise: in squares, what a crease of the least turn leaves
+/// of its best quadric in the smallest neighbourhood (0.071 times 3.57 spacings times tan 3 degrees, 0.013), and what a cylinder of five
+/// spacings' radius leaves of it there (0.012).
+const MODEL_ERROR: f64 = 0.018;
+/// A point is marked when the edge passes within this many spacings, less the standard deviation of its place: the spacing itself is known
+/// to three percent.
 pub(super) const THIN: f64 = 0.97;
 /// Farthest tip of a cone, in spacings, of which a place bears witness.
 const TIP_REACH: f64 = 4.0;
+/// Largest turn, rad (20 degrees), of a crease that may be but the first step of a curved surface.
 const FAINT: f64 = 0.35;
+/// Standard deviations of a neighbourhood's bend from which on it is a candidate.
 const SURE: f64 = 3.0;
 /// Share of the neighbours that must see an edge for it to be believed.
 const AGREEMENT: f64 = 0.45;
@@ -60,7 +76,6 @@ pub(super) enum Seen {
 /// An edge that several neighbourhoods agree upon, as seen from one place.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Agreed {
-    /// From the place to the edge, mm.
     /// From the place to the edge, as a share of the distance at which it is marked.
     pub distance: f64,
     /// The same for the corner.

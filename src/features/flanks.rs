@@ -2,9 +2,8 @@
 
 use glam::DVec3;
 
-use crate::points::moments::Moments;
-
 use super::patch::{Fit, Plane, Surface, fit, foot, meeting, varying};
+use crate::points::moments::Moments;
 
 /// Most surfaces a neighbourhood is split into before those that join smoothly are merged.
 const MOST_PLANES: usize = 5;
@@ -16,16 +15,22 @@ const STRAY: u8 = u8::MAX;
 const DECISIVE: f64 = 10.0;
 /// A crease that ought to be preferred by this much shows: of chi-squared its standard deviation is 13.
 const CLEAR: f64 = 45.0;
-const STEEP: f64 = 0.7;
+/// What remains of a crease |x| in the disc of radius one when the best quadric is taken out, root mean square; and what that quadric's
+/// curvature is. (Least squares over the disc; of the best surface of fourth degree 0.037 remains.)
+const DEPARTURE: f64 = 0.071;
 const BENDING: f64 = 2.036;
+/// Tangent of half a turn, 70 degrees, up to which both hold: beyond it a crease is no height function over its mean plane.
+const STEEP: f64 = 0.7;
+/// Share of the evidence due near a faint crease that must be there.
+const LOCAL: f64 = 0.4;
 /// Smallest turn angle, rad, that counts as sharp: 6 degrees.
 pub(super) const LEAST_TURN: f64 = 0.105;
 /// Farthest foot, in spacings, that is of interest.
 const FAR: f64 = 2.6;
 
-const DEPARTURE: f64 = 0.071;
+/// Largest turn angle, rad, that is an edge: 166 degrees. What is folded back farther is two sheets.
 const MOST_TURN: f64 = 2.9;
-const LOCAL: f64 = 0.4;
+
 /// An edge as one neighbourhood sees it, relative to its point, in spacings.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Crease {
@@ -537,13 +542,13 @@ impl Workshop {
         let near = |p: &&DVec3| p.distance_squared(e) <= within;
         let cap = 9.0 * variance;
         let mut creased = 0.0;
-        for s in 0..2 {
+        for (fit, part) in fits.iter().zip(&self.parts) {
             let mut count = 0;
-            for p in self.parts[s].iter().filter(near) {
-                creased += fits[s].surface.distance(*p).powi(2).min(cap) / variance;
+            for p in part.iter().filter(near) {
+                creased += fit.surface.distance(*p).powi(2).min(cap) / variance;
                 count += 1;
             }
-            creased += fits[s].parameters as f64 * f64::from(count.max(2)).ln();
+            creased += fit.parameters as f64 * f64::from(count.max(2)).ln();
         }
         self.whole.clear();
         self.whole.extend(self.points.iter().filter(near));
@@ -565,9 +570,7 @@ impl Workshop {
                 creased += fit.parameters as f64 * f64::from(count.max(2)).ln();
             }
         }
-        let Some(whole) = fit(&self.whole, variance) else {
-            return None;
-        };
+        let whole = fit(&self.whole, variance)?;
         // A surface of fourth degree follows a crease so far that a quarter of the squares remain.
         let smooth = if due > 8.0 * CLEAR {
             whole.criterion(variance)
