@@ -18,6 +18,7 @@ mod polynomial;
 mod resample;
 mod robust;
 mod scale;
+mod thesis;
 
 use std::borrow::Cow;
 
@@ -33,6 +34,7 @@ use levin::{LocalSurface, Smoothing};
 pub use polynomial::Degree;
 pub use resample::{Resampled, resample};
 pub use scale::Scale;
+pub use thesis::{LocalLine, ThesisSettings, ThesisSurface};
 
 /// Why no surface can be laid through a cloud.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
