@@ -18,7 +18,9 @@ use std::time::Instant;
 
 use acies::points::picture::{ViewDirection, render};
 use acies::points::{Frame, Neighbors, PointCloud};
-use acies::surface::{Degree, Place, Reconstruction, Scale, Settings, SmoothSurface, reconstruct};
+use acies::surface::{
+    Degree, Place, Reconstruction, Scale, Settings, SmoothSurface, reconstruct, resample,
+};
 use figures::Trial;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -213,7 +215,7 @@ fn mesh_of_fandisk() -> Option<String> {
     std::fs::read_to_string(beside.join("models/fandisk.obj")).ok()
 }
 
-/// `count` area samples of a mesh with noise in spacings, the spacing, mm, and the edges of the mesh that turn by more than 30 degrees.
+/// `count` area samples of a mesh with noise in spacings, the spacing, mm, and the edges of the mesh that turn by more than 10 degrees.
 fn fandisk_samples(mesh: &str, count: usize, noise: f64) -> (Vec<DVec3>, f64, Vec<truth::Edge>) {
     let triangles = obj_triangles(mesh);
     let (positions, spacing_mm) = sample(&triangles, count, noise);
@@ -224,7 +226,7 @@ fn fandisk_samples(mesh: &str, count: usize, noise: f64) -> (Vec<DVec3>, f64, Ve
         let normal = (*b - *a).cross(*c - *a).normalize_or_zero();
         for (p, q) in [(*a, *b), (*b, *c), (*c, *a)] {
             match sides.remove(&(key(q), key(p))) {
-                Some(other) if other.dot(normal) < 30f64.to_radians().cos() => {
+                Some(other) if other.dot(normal) < 10f64.to_radians().cos() => {
                     creases.push(truth::Edge::Segment(p, q));
                 }
                 Some(_) => {}
@@ -258,6 +260,9 @@ fn fandisk(mesh: &str, folder: &str) {
         .collect();
     draw(folder, "smooth", &rounded);
     draw(folder, "sharp", &with_lines(&result));
+    let dense = resample(&cloud, &data, 0.5 * scale.spacing_mm).expect("a spacing");
+    let dense: Vec<_> = dense.positions.into_iter().zip(dense.normals).collect();
+    draw(folder, "resampled", &dense);
     let raw = acies::surface::plane_normals(&cloud.positions, &data, 20);
     let input: Vec<_> = cloud.positions.iter().copied().zip(raw).collect();
     draw(folder, "input", &input);
@@ -272,18 +277,16 @@ fn with_lines(result: &Reconstruction) -> Vec<(DVec3, Vec3)> {
         .collect()
 }
 
-/// Writes a picture shaded by the angle to a lamp; both sides of a surface are lit.
+/// Writes a picture shaded by the angles to a red, a green and a blue lamp; both sides of a surface are lit.
 fn draw(folder: &str, name: &str, points: &[(DVec3, Vec3)]) {
-    let lamp = Vec3::new(0.4, 0.5, 0.77).normalize();
-    let fill = Vec3::new(-0.7, 0.6, -0.2).normalize();
+    let lamps = [
+        Vec3::new(0.8, 0.3, 0.5),
+        Vec3::new(-0.5, 0.7, 0.5),
+        Vec3::new(-0.2, -0.6, 0.75),
+    ];
     let positions: Vec<DVec3> = points.iter().map(|p| p.0).collect();
-    let colours: Vec<[u8; 3]> = points
-        .iter()
-        .map(|(_, n)| {
-            let light = 0.15 + 0.6 * n.dot(lamp).abs() + 0.25 * n.dot(fill).abs();
-            [(light * 250.0) as u8; 3]
-        })
-        .collect();
+    let lit = |n: Vec3| lamps.map(|lamp| (50.0 + 195.0 * n.dot(lamp.normalize()).abs()) as u8);
+    let colours: Vec<[u8; 3]> = points.iter().map(|(_, n)| lit(*n)).collect();
     let bytes = render(&positions, &colours, ViewDirection::Auto, (1200, 900));
     std::fs::write(format!("{folder}/fandisk-{name}.png"), bytes).expect("a writable folder");
 }

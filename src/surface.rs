@@ -12,6 +12,7 @@
 mod baseline;
 mod bulk;
 mod flank;
+mod implicit;
 mod levin;
 mod lines;
 mod polynomial;
@@ -30,6 +31,7 @@ use crate::points::{Neighbors, PointCloud};
 pub use baseline::{SmoothSurface, plane_normals, weighted_plane_normals};
 pub use bulk::{LinePoint, Reconstruction, SharpPoint, reconstruct};
 use flank::{Arrangement, Nearest, Neighborhood};
+pub use implicit::{ImplicitKind, ImplicitSurface};
 use levin::{LocalSurface, Smoothing};
 pub use polynomial::Degree;
 pub use resample::{Resampled, resample};

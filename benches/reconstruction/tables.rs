@@ -104,8 +104,11 @@ fn planes(percent: f64) -> Measured {
 
 fn print(name: &str, his: (f64, f64), [thesis, ours]: [&[f64]; 2]) {
     let pair = |v: &[f64]| {
+        if v.is_empty() {
+            return "none".to_owned();
+        }
         let worst = v.iter().copied().fold(0.0, f64::max);
-        let mean = v.iter().sum::<f64>() / v.len().max(1) as f64;
+        let mean = v.iter().sum::<f64>() / v.len() as f64;
         format!("{worst:.3} / {mean:.3}")
     };
     let his = format!("{:.3} / {:.3}", his.0 / HIS_SPACING, his.1 / HIS_SPACING);

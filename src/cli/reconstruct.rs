@@ -10,8 +10,8 @@ use super::{Failure, Status, print_line};
 use crate::features;
 use crate::points::{Column, Encoding, Neighbors, PointCloud, PointsError, Unit, read, write_ply};
 use crate::surface::{
-    Degree, Place, Scale, Settings, SmoothSurface, SurfaceError, ThesisSettings, ThesisSurface,
-    plane_normals, reconstruct, resample, weighted_plane_normals,
+    Degree, ImplicitKind, ImplicitSurface, Place, Scale, Settings, SmoothSurface, SurfaceError,
+    ThesisSettings, ThesisSurface, plane_normals, reconstruct, resample, weighted_plane_normals,
 };
 
 /// Take the points of a scan onto the surface they were measured from, keeping edges and corners sharp.
@@ -32,7 +32,7 @@ pub struct Reconstruct {
     /// The same as `--method smooth`.
     #[arg(long, conflicts_with = "resample")]
     smooth: bool,
-    /// Degree of the local polynomials.
+    /// Degree of the local polynomials; the last four methods have none.
     #[arg(long, default_value = "2", value_parser = clap::value_parser!(u8).range(1..=3))]
     degree: u8,
     /// h of the Gaussian weight exp(-d²/h²), mm; by default it follows from noise and spacing.
@@ -61,6 +61,10 @@ enum Method {
     Smooth,
     /// Neighbourhoods cut along a Bézier curve through detected points (Weber 2011, §4.3).
     Thesis,
+    /// Algebraic spheres (Guennebaud and Gross 2007).
+    Apss,
+    /// Robust implicit moving least squares (Öztireli et al. 2009).
+    Rimls,
     /// No projection, only normals: planes through the 30 nearest points (Hoppe et al. 1992).
     Plane,
     /// The same with Gaussian weights (Pauly et al. 2003).
@@ -262,6 +266,15 @@ impl Reconstruct {
                     degree,
                 };
                 ThesisSurface::new(positions, neighbors, &classes, settings).project_all()
+            }
+            Method::Apss | Method::Rimls => {
+                let kind = if method == Method::Apss {
+                    ImplicitKind::Apss
+                } else {
+                    ImplicitKind::Rimls
+                };
+                // Their weight falls to 1/e at 0.47 of its support.
+                ImplicitSurface::new(positions, neighbors, kind, h_mm / 0.47).project_all()
             }
             Method::Sharp | Method::Smooth => {
                 SmoothSurface::new(positions, neighbors, degree, h_mm).project_all()
