@@ -7,7 +7,9 @@
 //! We differ from the thesis in how the neighbourhood is cut. It draws a cubic Bézier curve through at least four marked feature points and
 //! decides the side of a neighbour by an angle; that needs points marked without error and lying on the edge. Here the flanks themselves
 //! are estimated, each from its own neighbours, and the feature line is where two of them meet: it needs no point on the edge, and at a
-//! corner all lines are there, not only the nearest.
+//! corner all lines are there, not only the nearest. Nor does it wait for a detector: the points that one smooth surface does not explain
+//! are the ones near a feature. His own way, with the features that a detector found, is [`ThesisSurface`]; it stands beside
+//! [`SmoothSurface`], [`ImplicitSurface`], [`plane_normals()`] and [`weighted_plane_normals()`] for comparison.
 
 mod baseline;
 mod bulk;
