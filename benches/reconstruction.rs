@@ -1,13 +1,16 @@
 //! Reconstruction on bodies whose surface is known: distances, normals and times, beside what other programs reach.
 //!
 //! `cargo bench --bench reconstruction` prints the tables. `-- quick` makes the large clouds smaller, `-- hard` runs blunt and acute edges,
-//! close sheets and slots, `-- two-million` the largest cloud, `-- only=NAME` the clouds whose name contains NAME, and
-//! `-- fandisk=FILE.obj picture=FOLDER` samples that mesh and draws it before and after.
+//! close sheets and slots, `-- two-million` the largest cloud, `-- memory` counts bytes, `-- only=NAME` the clouds whose name contains NAME, and
+//! `-- tables` prints Weber's tables only, and `-- pictures=FOLDER` draws the fandisk before and after; both find its mesh, where there
+//! is one, in `../shared/data/models`.
 
 #![allow(clippy::print_stdout)]
 
 #[path = "../tests/surface/figures.rs"]
 mod figures;
+#[path = "reconstruction/tables.rs"]
+mod tables;
 #[path = "../tests/surface/truth.rs"]
 mod truth;
 
@@ -15,7 +18,9 @@ use std::time::Instant;
 
 use acies::points::picture::{ViewDirection, render};
 use acies::points::{Frame, Neighbors, PointCloud};
-use acies::surface::{Degree, Place, Reconstruction, Scale, Settings, SmoothSurface, reconstruct};
+use acies::surface::{
+    Degree, Place, Reconstruction, Scale, Settings, SmoothSurface, reconstruct, resample,
+};
 use figures::Trial;
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
@@ -24,8 +29,29 @@ fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let has = |word: &str| arguments.iter().any(|a| a == word);
     let value = |key: &str| arguments.iter().find_map(|a| a.strip_prefix(key));
-    if let Some(mesh) = value("fandisk=") {
-        fandisk(mesh, value("picture="));
+    if let Some(folder) = value("pictures=") {
+        let mesh = mesh_of_fandisk().expect("../shared/data/models/fandisk.obj");
+        fandisk(&mesh, folder);
+        return;
+    }
+    if has("tables") {
+        tables::print_all(mesh_of_fandisk().as_deref());
+        return;
+    }
+    if has("memory") {
+        // All work on this thread: the counter counts by thread.
+        let pool = rayon::ThreadPoolBuilder::new()
+            .num_threads(1)
+            .use_current_thread();
+        let pool = pool.build().expect("a pool");
+        for trial in [
+            figures::block_trial(60_000),
+            figures::block_trial(200_000),
+            figures::block_trial(500_000),
+            figures::lines_trial(0.6),
+        ] {
+            pool.install(|| memory(&trial));
+        }
         return;
     }
     let mut trials = if has("hard") {
@@ -48,17 +74,17 @@ fn main() {
         "`x k20` the time as a multiple of a search for 20 neighbours of all points in the same run."
     );
     println!(
-        "{:<34}{:>15}{:>17}{:>15}{:>8}{:>9}{:>20}{:>8}{:>7}{:>9}",
+        "{:<34}{:>15}{:>17}{:>15}{:>13}{:>8}{:>10}{:>20}{:>8}{:>7}",
         "cloud",
         "input flat/edge",
         "output flat/edge",
         "gap own/all",
+        "false/max",
         "worst",
         "projected",
         "normals flat/edge",
         "seconds",
         "x k20",
-        "bytes/pt"
     );
     for trial in &trials {
         row(trial);
@@ -72,7 +98,7 @@ fn main() {
             "Others on the block, flat/edge: PCL order 2 0.039/0.107, CGAL jet 0.041/0.108, CGAL bilateral 0.040/0.117, APSS 0.056/0.072;"
         );
         println!("their normals within three spacings of an edge: 15.1 to 17.0.");
-        weber();
+        tables::print_all(mesh_of_fandisk().as_deref());
     }
 }
 
@@ -126,19 +152,18 @@ fn row(trial: &Trial) {
     let cloud = figures::cloud_of(&trial.seen);
     let neighbors = Neighbors::new(&cloud.positions);
     let search = neighbour_search(&cloud.positions, &neighbors, 20);
-    let before = peak_bytes();
     let start = Instant::now();
     let result = reconstruct(&cloud, &neighbors, Settings::default()).expect("enough points");
     let seconds = start.elapsed().as_secs_f64();
-    let bytes = (peak_bytes() - before) / cloud.positions.len() as f64;
     let search = 0.5 * (search + neighbour_search(&cloud.positions, &neighbors, 20));
     let f = trial.figures(&result);
     println!(
-        "{:<34}{:>15}{:>17}{:>15}{:>8.3}{:>9.4}{:>20}{:>8.2}{:>7.1}{:>9.0}",
+        "{:<34}{:>15}{:>17}{:>15}{:>13}{:>8.3}{:>10.4}{:>20}{:>8.2}{:>7.1}",
         trial.name,
         format!("{:.4}/{:.4}", f.input_flat, f.input_edge),
         format!("{:.4}/{:.4}", f.flat, f.edge),
         format!("{:.3}/{:.3}", f.edge_gap_own, f.edge_gap),
+        format!("{:.4}/{:.2}", f.line_false, f.line_worst),
         f.worst,
         f.projected,
         format!(
@@ -147,16 +172,22 @@ fn row(trial: &Trial) {
         ),
         seconds,
         seconds / search,
-        bytes,
     );
 }
 
-/// Most memory this process ever held, bytes; 0 where the system does not say.
-fn peak_bytes() -> f64 {
-    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
-    let kib = line.and_then(|l| l.trim().trim_end_matches(" kB").parse::<f64>().ok());
-    kib.unwrap_or(0.0) * 1024.0
+/// Bytes a point that the reconstruction holds at most above its input and the neighbours, counted at the allocator.
+fn memory(trial: &Trial) {
+    let cloud = figures::cloud_of(&trial.seen);
+    let neighbors = Neighbors::new(&cloud.positions);
+    let measured = allocation_counter::measure(|| {
+        let result = reconstruct(&cloud, &neighbors, Settings::default()).expect("enough points");
+        assert_eq!(result.positions.len(), cloud.positions.len());
+    });
+    println!(
+        "{:<34}{:>9.1} bytes a point at the most",
+        trial.name,
+        measured.bytes_max as f64 / cloud.positions.len() as f64
+    );
 }
 
 /// Seconds for the `k` nearest neighbours of all points, the reference of all times here.
@@ -178,78 +209,39 @@ fn neighbour_search(positions: &[DVec3], neighbors: &Neighbors, k: usize) -> f64
     start.elapsed().as_secs_f64()
 }
 
-/// Weber's Tables 3 to 6 beside ours: feature lines against the true ones, output points against the nearest data points. His distances
-/// are divided by his spacing of 0.125.
-fn weber() {
-    println!();
-    println!(
-        "Weber 2011, in spacings of the points (his lengths divided by 0.125): largest / mean"
-    );
-    let cube = |n: usize, percent: f64| figures::cube_trial(n, percent);
-    for (table, trial, his) in [
-        (
-            "3  feature line, cube with hole",
-            cube(96, 0.0),
-            (0.0447, 0.0206),
-        ),
-        ("4  ..., noise 0.5 %", cube(96, 0.5), (0.0457, 0.0185)),
-        ("4  ..., noise 1 %", cube(96, 1.0), (0.0880, 0.0363)),
-        ("4  ..., noise 2 %", cube(96, 2.0), (0.0785, 0.0591)),
-    ] {
-        let (_, result) = trial.run(Settings::default());
-        let off = |l: &DVec3| trial.body.edge_distance(*l) / trial.unit_mm;
-        let lines: Vec<f64> = result.lines.iter().map(|l| off(&l.position)).collect();
-        print_pair(table, &lines, his);
+/// The text of the fandisk's mesh where it lies beside the project.
+fn mesh_of_fandisk() -> Option<String> {
+    let beside = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
+    std::fs::read_to_string(beside.join("models/fandisk.obj")).ok()
+}
+
+/// `count` area samples of a mesh with noise in spacings, the spacing, mm, and the edges of the mesh that turn by more than 10 degrees.
+fn fandisk_samples(mesh: &str, count: usize, noise: f64) -> (Vec<DVec3>, f64, Vec<truth::Edge>) {
+    let triangles = obj_triangles(mesh);
+    let (positions, spacing_mm) = sample(&triangles, count, noise);
+    let key = |p: DVec3| p.to_array().map(f64::to_bits);
+    let mut sides: std::collections::HashMap<_, DVec3> = std::collections::HashMap::new();
+    let mut creases = Vec::new();
+    for [a, b, c] in &triangles {
+        let normal = (*b - *a).cross(*c - *a).normalize_or_zero();
+        for (p, q) in [(*a, *b), (*b, *c), (*c, *a)] {
+            match sides.remove(&(key(q), key(p))) {
+                Some(other) if other.dot(normal) < 10f64.to_radians().cos() => {
+                    creases.push(truth::Edge::Segment(p, q));
+                }
+                Some(_) => {}
+                None => drop(sides.insert((key(p), key(q)), normal)),
+            }
+        }
     }
-    for (table, trial, his) in [
-        (
-            "5  output to data, cube with hole",
-            cube(96, 0.0),
-            (0.17, 0.018),
-        ),
-        ("6  ..., noise 1 %", cube(96, 1.0), (0.43, 0.0307)),
-    ] {
-        let (_, result) = trial.run(Settings::default());
-        let data = Neighbors::new(&trial.seen.iter().map(|s| s.noisy).collect::<Vec<_>>());
-        print_pair(
-            table,
-            &to_data(&result.positions, &data, trial.unit_mm),
-            his,
-        );
-    }
+    (positions, spacing_mm, creases)
 }
 
-fn to_data(output: &[DVec3], data: &Neighbors, unit_mm: f64) -> Vec<f64> {
-    let mut found = Vec::new();
-    let nearest = |p: &DVec3| {
-        data.nearest(*p, 1, &mut found);
-        found[0].1.sqrt() / unit_mm
-    };
-    output.iter().map(nearest).collect()
-}
-
-fn print_pair(table: &str, ours: &[f64], his: (f64, f64)) {
-    let worst = ours.iter().copied().fold(0.0, f64::max);
-    let mean = ours.iter().sum::<f64>() / ours.len().max(1) as f64;
-    println!(
-        "{table:<36} his {:>7.3} / {:>6.3}   ours {worst:>7.3} / {mean:>6.3}",
-        his.0 / 0.125,
-        his.1 / 0.125
-    );
-}
-
-/// Samples a triangle mesh, adds noise of a tenth of the spacing, reconstructs it, and draws input, smooth and sharp output.
-fn fandisk(mesh: &str, folder: Option<&str>) {
-    let text = std::fs::read_to_string(mesh).expect("a readable mesh");
-    let triangles = obj_triangles(&text);
-    let (positions, spacing_mm) = sample(&triangles, 41_250);
+/// Samples the fandisk with noise of a tenth of the spacing, reconstructs it, and draws input, smooth and sharp output.
+fn fandisk(mesh: &str, folder: &str) {
+    let (positions, _, _) = fandisk_samples(mesh, 41_250, 0.1);
     let data = Neighbors::new(&positions);
-    let cloud = PointCloud {
-        frame: Frame::Part,
-        positions,
-        origins: Vec::new(),
-        views: Vec::new(),
-    };
+    let cloud = PointCloud::from_positions(Frame::Part, positions);
     let result = reconstruct(&cloud, &data, Settings::default()).expect("enough points");
     let on = |place: Place| result.lines.iter().filter(|l| l.place == place).count();
     println!(
@@ -258,12 +250,6 @@ fn fandisk(mesh: &str, folder: Option<&str>) {
         on(Place::Edge),
         on(Place::Corner)
     );
-    print_pair(
-        "5  output to data, fandisk",
-        &to_data(&result.positions, &data, spacing_mm),
-        (0.204, 0.003),
-    );
-    let Some(folder) = folder else { return };
     let scale = Scale::of(&cloud, &data);
     let smooth = SmoothSurface::new(&cloud.positions, &data, Degree::Two, scale.smoothing_mm())
         .project_all();
@@ -274,12 +260,12 @@ fn fandisk(mesh: &str, folder: Option<&str>) {
         .collect();
     draw(folder, "smooth", &rounded);
     draw(folder, "sharp", &with_lines(&result));
+    let dense = resample(&cloud, &data, 0.5 * scale.spacing_mm).expect("a spacing");
+    let dense: Vec<_> = dense.positions.into_iter().zip(dense.normals).collect();
+    draw(folder, "resampled", &dense);
     let raw = acies::surface::plane_normals(&cloud.positions, &data, 20);
-    draw(
-        folder,
-        "input",
-        &cloud.positions.iter().copied().zip(raw).collect::<Vec<_>>(),
-    );
+    let input: Vec<_> = cloud.positions.iter().copied().zip(raw).collect();
+    draw(folder, "input", &input);
 }
 
 fn with_lines(result: &Reconstruction) -> Vec<(DVec3, Vec3)> {
@@ -291,18 +277,16 @@ fn with_lines(result: &Reconstruction) -> Vec<(DVec3, Vec3)> {
         .collect()
 }
 
-/// Writes a picture shaded by the angle to a lamp; both sides of a surface are lit.
+/// Writes a picture shaded by the angles to a red, a green and a blue lamp; both sides of a surface are lit.
 fn draw(folder: &str, name: &str, points: &[(DVec3, Vec3)]) {
-    let lamp = Vec3::new(0.4, 0.5, 0.77).normalize();
-    let fill = Vec3::new(-0.7, 0.6, -0.2).normalize();
+    let lamps = [
+        Vec3::new(0.8, 0.3, 0.5),
+        Vec3::new(-0.5, 0.7, 0.5),
+        Vec3::new(-0.2, -0.6, 0.75),
+    ];
     let positions: Vec<DVec3> = points.iter().map(|p| p.0).collect();
-    let colours: Vec<[u8; 3]> = points
-        .iter()
-        .map(|(_, n)| {
-            let light = 0.15 + 0.6 * n.dot(lamp).abs() + 0.25 * n.dot(fill).abs();
-            [(light * 250.0) as u8; 3]
-        })
-        .collect();
+    let lit = |n: Vec3| lamps.map(|lamp| (50.0 + 195.0 * n.dot(lamp.normalize()).abs()) as u8);
+    let colours: Vec<[u8; 3]> = points.iter().map(|(_, n)| lit(*n)).collect();
     let bytes = render(&positions, &colours, ViewDirection::Auto, (1200, 900));
     std::fs::write(format!("{folder}/fandisk-{name}.png"), bytes).expect("a writable folder");
 }
@@ -329,8 +313,8 @@ fn obj_triangles(text: &str) -> Vec<[DVec3; 3]> {
     triangles
 }
 
-/// `count` random points of the triangles by area with noise of a tenth of the spacing, and the spacing.
-fn sample(triangles: &[[DVec3; 3]], count: usize) -> (Vec<DVec3>, f64) {
+/// `count` random points of the triangles by area with noise in spacings, and the spacing.
+fn sample(triangles: &[[DVec3; 3]], count: usize, noise: f64) -> (Vec<DVec3>, f64) {
     let mut dice = truth::Dice(3);
     let mut sums = Vec::with_capacity(triangles.len());
     let mut area = 0.0;
@@ -346,7 +330,7 @@ fn sample(triangles: &[[DVec3; 3]], count: usize) -> (Vec<DVec3>, f64) {
         if u + v > 1.0 {
             (u, v) = (1.0 - u, 1.0 - v);
         }
-        a + (b - a) * u + (c - a) * v + dice.cloud() * (0.1 * spacing)
+        a + (b - a) * u + (c - a) * v + dice.cloud() * (noise * spacing)
     };
     ((0..count).map(point).collect(), spacing)
 }

@@ -7,17 +7,21 @@
 //! We differ from the thesis in how the neighbourhood is cut. It draws a cubic Bézier curve through at least four marked feature points and
 //! decides the side of a neighbour by an angle; that needs points marked without error and lying on the edge. Here the flanks themselves
 //! are estimated, each from its own neighbours, and the feature line is where two of them meet: it needs no point on the edge, and at a
-//! corner all lines are there, not only the nearest.
+//! corner all lines are there, not only the nearest. Nor does it wait for a detector: the points that one smooth surface does not explain
+//! are the ones near a feature. His own way, with the features that a detector found, is [`ThesisSurface`]; it stands beside
+//! [`SmoothSurface`], [`ImplicitSurface`], [`plane_normals()`] and [`weighted_plane_normals()`] for comparison.
 
 mod baseline;
 mod bulk;
 mod flank;
+mod implicit;
 mod levin;
 mod lines;
 mod polynomial;
 mod resample;
 mod robust;
 mod scale;
+mod thesis;
 
 use std::borrow::Cow;
 
@@ -29,10 +33,12 @@ use crate::points::{Neighbors, PointCloud};
 pub use baseline::{SmoothSurface, plane_normals, weighted_plane_normals};
 pub use bulk::{LinePoint, Reconstruction, SharpPoint, reconstruct};
 use flank::{Arrangement, Nearest, Neighborhood};
+pub use implicit::{ImplicitKind, ImplicitSurface};
 use levin::{LocalSurface, Smoothing};
 pub use polynomial::Degree;
 pub use resample::{Resampled, resample};
 pub use scale::Scale;
+pub use thesis::{LocalLine, ThesisSettings, ThesisSurface};
 
 /// Why no surface can be laid through a cloud.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -7,26 +7,40 @@ use anyhow::anyhow;
 use glam::{DVec3, Vec3};
 
 use super::{Failure, Status, print_line};
+use crate::features;
 use crate::points::{Column, Encoding, Neighbors, PointCloud, PointsError, Unit, read, write_ply};
 use crate::surface::{
-    Degree, Place, Scale, Settings, SmoothSurface, SurfaceError, reconstruct, resample,
+    Degree, ImplicitKind, ImplicitSurface, Place, Scale, Settings, SmoothSurface, SurfaceError,
+    ThesisSettings, ThesisSurface, plane_normals, reconstruct, resample, weighted_plane_normals,
 };
 
 /// Take the points of a scan onto the surface they were measured from, keeping edges and corners sharp.
 ///
 /// Noise is averaged away along the surface but never across an edge; points within noise of an edge end on it. All sizes follow from the
 /// spacing and the noise of the points. The result has the points in the order of the scan with their unit normals; `projected` is 0
-/// where a point was left where it was because its surroundings say nothing certain.
+/// where a point was left where it was because its surroundings say nothing certain, `feature` says 0 face, 1 edge, 2 corner.
 #[derive(Debug, clap::Args)]
 pub struct Reconstruct {
     /// PLY, PCD, XYZ or CSV text, STL or OBJ.
     scan: PathBuf,
-    /// Where to write the result: PLY with x y z nx ny nz (double) and projected (uchar).
+    /// Where to write the result: PLY with x y z nx ny nz (double), projected and feature (uchar).
     #[arg(short = 'o', long = "output", value_name = "OUT.ply")]
     output: Option<PathBuf>,
-    /// Smooth moving least squares, for comparison: rounds every edge.
+    /// How the points find their surface; all but `sharp` are there for comparison.
+    #[arg(long, value_enum, default_value = "sharp", conflicts_with_all = ["resample", "smooth"])]
+    method: Method,
+    /// The same as `--method smooth`.
     #[arg(long, conflicts_with = "resample")]
     smooth: bool,
+    /// Degree of the local polynomials; the last four methods have none.
+    #[arg(long, default_value = "2", value_parser = clap::value_parser!(u8).range(1..=3))]
+    degree: u8,
+    /// h of the Gaussian weight exp(-d²/h²), mm; by default it follows from noise and spacing.
+    #[arg(long, value_name = "H")]
+    smoothing: Option<f64>,
+    /// After the scan's points also write samples of the edges and the corners; `mx my mz` is the normal of an edge's other side.
+    #[arg(long, conflicts_with_all = ["resample", "smooth"])]
+    edges: bool,
     /// Instead of the scan's points, new ones this far apart (mm), with extra points along the edges; `feature` says 0 face, 1 edge, 2 corner.
     #[arg(long, value_name = "SPACING")]
     resample: Option<f64>,
@@ -38,6 +52,25 @@ pub struct Reconstruct {
     json: bool,
 }
 
+/// The ways to a surface.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Method {
+    /// Moving least squares that keeps edges and corners.
+    Sharp,
+    /// Moving least squares that rounds every edge (Levin).
+    Smooth,
+    /// Neighbourhoods cut along a Bézier curve through detected points (Weber 2011, §4.3).
+    Thesis,
+    /// Algebraic spheres (Guennebaud and Gross 2007).
+    Apss,
+    /// Robust implicit moving least squares (Öztireli et al. 2009).
+    Rimls,
+    /// No projection, only normals: planes through the 30 nearest points (Hoppe et al. 1992).
+    Plane,
+    /// The same with Gaussian weights (Pauly et al. 2003).
+    WeightedPlane,
+}
+
 /// What the command says about its work.
 #[derive(Debug, serde::Serialize)]
 struct Summary {
@@ -46,6 +79,8 @@ struct Summary {
     projected: usize,
     on_edges: usize,
     on_corners: usize,
+    /// Samples of edges and corners after the scan's points.
+    edge_samples: usize,
     spacing_mm: f64,
     noise_mm: f64,
     /// Root mean square of the way the projected points went, mm.
@@ -62,14 +97,19 @@ struct Seconds {
     write: f64,
 }
 
+/// Neighbours of a plane (Ma 2011, §4.2.1).
+const PLANE_NEIGHBOURS: usize = 30;
+
 /// Points to be written.
 struct Result {
     positions: Vec<DVec3>,
     normals: Vec<Vec3>,
-    flag_name: &'static str,
-    flags: Vec<u8>,
-    counts: [usize; 2],
-    projected: usize,
+    /// 1 where a point was taken onto the surface; none for new points.
+    projected: Option<Vec<u8>>,
+    features: Vec<u8>,
+    /// Normals of the other sides of edges, where wanted.
+    others: Option<Vec<Vec3>>,
+    edge_samples: usize,
     scale: Scale,
 }
 
@@ -90,6 +130,11 @@ impl Reconstruct {
         lap(&mut seconds.read);
         let neighbors = Neighbors::new(&scan.cloud.positions);
         lap(&mut seconds.neighbours);
+        if let Some(h) = self.smoothing.filter(|h| !(h.is_finite() && *h > 0.0)) {
+            return Err(Failure::Usage(anyhow!(
+                "--smoothing: {h}, expected a length above 0 mm"
+            )));
+        }
         let result = self.work(&scan.cloud, &neighbors)?;
         lap(&mut seconds.surface);
         if let Some(path) = &self.output {
@@ -100,9 +145,10 @@ impl Reconstruct {
         let summary = Summary {
             points: scan.cloud.positions.len(),
             points_out: result.positions.len(),
-            projected: result.projected,
-            on_edges: result.counts[0],
-            on_corners: result.counts[1],
+            projected: result.projected_count(),
+            on_edges: result.count(Place::Edge),
+            on_corners: result.count(Place::Corner),
+            edge_samples: result.edge_samples,
             spacing_mm: result.scale.spacing_mm,
             noise_mm: result.scale.noise_mm,
             moved_rms_mm: if same_points {
@@ -121,18 +167,132 @@ impl Reconstruct {
         cloud: &PointCloud,
         neighbors: &Neighbors,
     ) -> std::result::Result<Result, Failure> {
+        let method = if self.smooth {
+            Method::Smooth
+        } else {
+            self.method
+        };
         if let Some(spacing_mm) = self.resample {
             resampled(cloud, neighbors, spacing_mm)
-        } else if self.smooth {
-            smooth(cloud, neighbors)
+        } else if method == Method::Sharp {
+            self.sharp(cloud, neighbors)
         } else {
-            sharp(cloud, neighbors)
+            self.baseline(method, cloud, neighbors)
         }
         .map_err(|error| match error {
             SurfaceError::Spacing { .. } => Failure::Usage(error.into()),
             SurfaceError::TooFewPoints { .. } => {
                 Failure::BadInput(anyhow!("{}: {error}", self.scan.display()))
             }
+        })
+    }
+
+    fn degree(&self) -> Degree {
+        match self.degree {
+            1 => Degree::One,
+            3 => Degree::Three,
+            _ => Degree::Two,
+        }
+    }
+
+    fn sharp(
+        &self,
+        cloud: &PointCloud,
+        neighbors: &Neighbors,
+    ) -> std::result::Result<Result, SurfaceError> {
+        let settings = Settings {
+            degree: self.degree(),
+            smoothing_mm: self.smoothing,
+        };
+        let done = reconstruct(cloud, neighbors, settings)?;
+        let mut features = vec![Place::Face as u8; done.positions.len()];
+        for sharp in &done.sharp {
+            features[sharp.index as usize] = sharp.place as u8;
+        }
+        let mut result = Result {
+            projected: Some(done.projected.iter().map(|p| u8::from(*p)).collect()),
+            positions: done.positions,
+            normals: done.normals,
+            features,
+            others: None,
+            edge_samples: 0,
+            scale: done.scale,
+        };
+        if self.edges {
+            let mut others = vec![Vec3::ZERO; result.positions.len()];
+            for sharp in &done.sharp {
+                others[sharp.index as usize] = sharp.other_normals[0];
+            }
+            for line in &done.lines {
+                result.positions.push(line.position);
+                result.normals.push(line.normals[0]);
+                result.features.push(line.place as u8);
+                others.push(line.normals[1]);
+            }
+            let projected = result.projected.iter_mut();
+            projected.for_each(|p| p.resize(result.positions.len(), 1));
+            result.others = Some(others);
+            result.edge_samples = done.lines.len();
+        }
+        Ok(result)
+    }
+
+    fn baseline(
+        &self,
+        method: Method,
+        cloud: &PointCloud,
+        neighbors: &Neighbors,
+    ) -> std::result::Result<Result, SurfaceError> {
+        let scale = Scale::of(cloud, neighbors);
+        let positions = &cloud.positions;
+        let h_mm = self.smoothing.unwrap_or(scale.smoothing_mm());
+        let degree = self.degree();
+        let points: Vec<Option<(DVec3, DVec3)>> = match method {
+            Method::Plane | Method::WeightedPlane => {
+                let normals = if method == Method::Plane {
+                    plane_normals(positions, neighbors, PLANE_NEIGHBOURS)
+                } else {
+                    weighted_plane_normals(positions, neighbors, PLANE_NEIGHBOURS)
+                };
+                let found = |(p, n): (&DVec3, Vec3)| (n != Vec3::ZERO).then(|| (*p, n.as_dvec3()));
+                positions.iter().zip(normals).map(found).collect()
+            }
+            Method::Thesis => {
+                let classes =
+                    features::detect(cloud, neighbors, features::Method::Adaptive).classes;
+                let settings = ThesisSettings {
+                    k: 20,
+                    h_mm,
+                    degree,
+                };
+                ThesisSurface::new(positions, neighbors, &classes, settings).project_all()
+            }
+            Method::Apss | Method::Rimls => {
+                let kind = if method == Method::Apss {
+                    ImplicitKind::Apss
+                } else {
+                    ImplicitKind::Rimls
+                };
+                // Their weight falls to 1/e at 0.47 of its support.
+                ImplicitSurface::new(positions, neighbors, kind, h_mm / 0.47).project_all()
+            }
+            Method::Sharp | Method::Smooth => {
+                SmoothSurface::new(positions, neighbors, degree, h_mm).project_all()
+            }
+        };
+        Ok(Result {
+            projected: Some(points.iter().map(|p| u8::from(p.is_some())).collect()),
+            normals: points
+                .iter()
+                .map(|p| p.map_or(Vec3::ZERO, |p| p.1.as_vec3()))
+                .collect(),
+            positions: (points.iter().zip(positions))
+                .map(|(p, old)| p.map_or(*old, |p| p.0))
+                .collect(),
+            features: vec![Place::Face as u8; points.len()],
+            others: None,
+            edge_samples: 0,
+            scale,
         })
     }
 
@@ -166,43 +326,18 @@ fn reading(error: PointsError) -> Failure {
     }
 }
 
-fn sharp(cloud: &PointCloud, neighbors: &Neighbors) -> std::result::Result<Result, SurfaceError> {
-    let done = reconstruct(cloud, neighbors, Settings::default())?;
-    let on = |place: Place| done.sharp.iter().filter(|s| s.place == place).count();
-    Ok(Result {
-        counts: [on(Place::Edge), on(Place::Corner)],
-        projected: done.projected.iter().filter(|p| **p).count(),
-        flags: done.projected.iter().map(|p| u8::from(*p)).collect(),
-        flag_name: "projected",
-        positions: done.positions,
-        normals: done.normals,
-        scale: done.scale,
-    })
-}
+impl Result {
+    fn count(&self, place: Place) -> usize {
+        let measured = self.features.len() - self.edge_samples;
+        let on = self.features[..measured].iter();
+        on.filter(|f| **f == place as u8).count()
+    }
 
-fn smooth(cloud: &PointCloud, neighbors: &Neighbors) -> std::result::Result<Result, SurfaceError> {
-    let scale = Scale::of(cloud, neighbors);
-    let surface = SmoothSurface::new(
-        &cloud.positions,
-        neighbors,
-        Degree::Two,
-        scale.smoothing_mm(),
-    );
-    let points = surface.project_all();
-    Ok(Result {
-        counts: [0, 0],
-        projected: points.iter().flatten().count(),
-        flags: points.iter().map(|p| u8::from(p.is_some())).collect(),
-        flag_name: "projected",
-        normals: points
-            .iter()
-            .map(|p| p.map_or(Vec3::ZERO, |p| p.1.as_vec3()))
-            .collect(),
-        positions: (points.iter().zip(&cloud.positions))
-            .map(|(p, old)| p.map_or(*old, |p| p.0))
-            .collect(),
-        scale,
-    })
+    fn projected_count(&self) -> usize {
+        let all = self.positions.len() - self.edge_samples;
+        let projected = self.projected.as_ref();
+        projected.map_or(all, |p| p[..all].iter().filter(|p| **p == 1).count())
+    }
 }
 
 fn resampled(
@@ -211,14 +346,13 @@ fn resampled(
     spacing_mm: f64,
 ) -> std::result::Result<Result, SurfaceError> {
     let done = resample(cloud, neighbors, spacing_mm)?;
-    let on = |place: Place| done.places.iter().filter(|p| **p == place).count();
     Ok(Result {
-        counts: [on(Place::Edge), on(Place::Corner)],
-        projected: done.positions.len(),
-        flags: done.places.iter().map(|p| *p as u8).collect(),
-        flag_name: "feature",
+        projected: None,
+        features: done.places.iter().map(|p| *p as u8).collect(),
         positions: done.positions,
         normals: done.normals,
+        others: None,
+        edge_samples: 0,
         scale: done.scale,
     })
 }
@@ -226,19 +360,31 @@ fn resampled(
 fn moved_rms(cloud: &PointCloud, result: &Result) -> f64 {
     let ways = cloud.positions.iter().zip(&result.positions);
     let sum: f64 = ways.map(|(a, b)| a.distance_squared(*b)).sum();
-    (sum / result.projected.max(1) as f64).sqrt()
+    (sum / result.projected_count().max(1) as f64).sqrt()
 }
 
 fn write(path: &std::path::Path, result: &Result) -> std::result::Result<(), Failure> {
-    let part =
-        |axis: usize| -> Vec<f64> { result.normals.iter().map(|n| f64::from(n[axis])).collect() };
-    let (nx, ny, nz) = (part(0), part(1), part(2));
-    let columns = [
+    let split = |normals: &[Vec3]| {
+        [0, 1, 2].map(|axis| -> Vec<f64> { normals.iter().map(|n| f64::from(n[axis])).collect() })
+    };
+    let [nx, ny, nz] = split(&result.normals);
+    let others = result.others.as_deref().map(split);
+    let mut columns = vec![
         Column::F64("nx", &nx),
         Column::F64("ny", &ny),
         Column::F64("nz", &nz),
-        Column::U8(result.flag_name, &result.flags),
     ];
+    if let Some([mx, my, mz]) = &others {
+        columns.extend([
+            Column::F64("mx", mx),
+            Column::F64("my", my),
+            Column::F64("mz", mz),
+        ]);
+    }
+    if let Some(projected) = &result.projected {
+        columns.push(Column::U8("projected", projected));
+    }
+    columns.push(Column::U8("feature", &result.features));
     write_ply(path, &result.positions, &columns, Encoding::LittleEndian)
         .map_err(|e| Failure::Io(e.into()))
 }

@@ -4,7 +4,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::flank::Nearest;
-use super::lines::{self, Sighting};
+use super::lines::{self, Sightings};
 use super::robust::robust_normal;
 use super::{
     LINE_SPACING, Meetings, Outcome, Place, Scale, Scratch, Settings, Surface, SurfaceError,
@@ -12,10 +12,14 @@ use super::{
 use crate::points::{Neighbors, PointCloud};
 
 /// Points whose results are held at once, before they go to their places.
-const BLOCK: usize = 32_768;
+const BLOCK: usize = 16_384;
 
 /// Points a worker takes at a time.
 const GRAIN: usize = 256;
+
+/// The same where flanks are told apart: each takes twenty times as long, and its result ten times the memory.
+const SHARP_BLOCK: usize = 2_048;
+const SHARP_GRAIN: usize = 32;
 
 /// A cloud's points on its surface, in input order.
 #[derive(Debug, Clone)]
@@ -84,8 +88,8 @@ pub(super) struct Sink<'s> {
 
 /// Takes every point of `cloud` onto the surface through it.
 ///
-/// The result does not depend on the number of threads. Memory above the cloud and its neighbours: 46 bytes a point, and while
-/// it works 320 for every point near an edge, for what it saw of the feature lines.
+/// The result does not depend on the number of threads. Memory above the cloud and its neighbours: 38 bytes a point and what the feature
+/// lines take; in scan lines also 90 for every supporting point.
 ///
 /// # Errors
 /// [`SurfaceError::TooFewPoints`].
@@ -97,7 +101,11 @@ pub fn reconstruct(
     let mut surface = Surface::unprepared(cloud, neighbors, settings)?;
     let mut positions = cloud.positions.clone();
     let mut projected = vec![false; positions.len()];
-    let mut features = Features::default();
+    let line_spacing_mm = LINE_SPACING * surface.scale.spacing_mm;
+    let mut features = Features {
+        sharp: Vec::new(),
+        lines: Sightings::new(line_spacing_mm),
+    };
     let normals = if surface.scale.thinning_mm > 0.0 {
         prepare(&mut surface, None);
         let mut normals = vec![Vec3::ZERO; positions.len()];
@@ -115,43 +123,46 @@ pub fn reconstruct(
             projected: &mut projected,
         };
         let suspicious = prepare(&mut surface, Some(sink));
+        // The first normals are looked at until the last point has landed.
         let mut later = Vec::with_capacity(suspicious.len());
         features.land(&surface, cloud, (&suspicious, false), |landed| {
-            later.push(landed)
-        });
-        let mut normals = std::mem::take(&mut surface.normals);
-        for landed in later {
             let index = landed.index as usize;
-            normals[index] = landed.normal;
             positions[index] = landed.position;
             projected[index] = landed.state == State::Smooth;
+            later.push(landed.normal);
+        });
+        let mut normals = std::mem::take(&mut surface.normals);
+        for (&index, normal) in suspicious.iter().zip(later) {
+            normals[index as usize] = normal;
         }
         normals
     };
+    let scale = surface.scale;
+    drop(surface);
     features.sharp.sort_unstable_by_key(|s| s.index);
-    let line_spacing_mm = LINE_SPACING * surface.scale.spacing_mm;
     Ok(Reconstruction {
         positions,
         normals,
         projected,
         sharp: features.sharp,
-        lines: lines::agree(features.lines, line_spacing_mm),
+        lines: lines::agree(features.lines),
         line_spacing_mm,
-        scale: surface.scale,
+        scale,
     })
 }
 
 /// First normals and trust of all supporting points: where the surroundings are smooth the surface's own, elsewhere those of a plane
 /// that neighbouring flanks do not tilt. Returns the indices of the latter, neighbours together; the positions of the former go to `sink`.
 pub(super) fn prepare(surface: &mut Surface, mut sink: Option<Sink>) -> Vec<u32> {
-    let order: Vec<u32> = surface.neighbors.get().order().to_vec();
+    let mut normals = std::mem::take(&mut surface.normals);
+    let mut trust = std::mem::take(&mut surface.trust);
     let mut suspicious = Vec::new();
-    for block in order.chunks(BLOCK) {
-        let landed = in_parallel(block, |index, scratch| surface.first_look(index, scratch));
-        for point in landed {
+    for block in surface.neighbors.get().order().chunks(BLOCK) {
+        let look = |index, scratch: &mut Scratch| surface.first_look(index, scratch);
+        for point in in_parallel(block, GRAIN, look).into_iter().flatten() {
             let index = point.index as usize;
-            surface.normals[index] = point.normal;
-            surface.trust[index] = point.trust;
+            normals[index] = point.normal;
+            trust[index] = point.trust;
             if point.state == State::Suspicious {
                 suspicious.push(point.index);
             } else if let Some(sink) = &mut sink {
@@ -160,17 +171,23 @@ pub(super) fn prepare(surface: &mut Surface, mut sink: Option<Sink>) -> Vec<u32>
             }
         }
     }
+    surface.normals = normals;
+    surface.trust = trust;
     suspicious
 }
 
-fn in_parallel<T: Send>(block: &[u32], work: impl Fn(u32, &mut Scratch) -> T + Sync) -> Vec<T> {
-    let parts: Vec<Vec<T>> = block
-        .par_chunks(GRAIN)
+/// Results of `work` for a block of points, in parts of `grain`.
+fn in_parallel<T: Send>(
+    block: &[u32],
+    grain: usize,
+    work: impl Fn(u32, &mut Scratch) -> T + Sync,
+) -> Vec<Vec<T>> {
+    block
+        .par_chunks(grain)
         .map_init(Scratch::default, |scratch, part| {
             part.iter().map(|&index| work(index, scratch)).collect()
         })
-        .collect();
-    parts.into_iter().flatten().collect()
+        .collect()
 }
 
 impl Surface<'_> {
@@ -208,10 +225,9 @@ impl Surface<'_> {
 }
 
 /// Edges and corners met on the way.
-#[derive(Default)]
 struct Features {
     sharp: Vec<SharpPoint>,
-    lines: Vec<Sighting>,
+    lines: Sightings,
 }
 
 impl Features {
@@ -222,8 +238,8 @@ impl Features {
         (indices, try_smooth): (&[u32], bool),
         mut put: impl FnMut(Landed),
     ) {
-        for block in indices.chunks(BLOCK) {
-            let landed = in_parallel(block, |index, scratch| {
+        for block in indices.chunks(SHARP_BLOCK) {
+            let landed = in_parallel(block, SHARP_GRAIN, |index, scratch| {
                 land_one(
                     surface,
                     cloud.positions[index as usize],
@@ -231,13 +247,12 @@ impl Features {
                     scratch,
                 )
             });
-            for (&index, (nearest, meetings)) in block.iter().zip(landed) {
+            for (&index, (nearest, meetings)) in block.iter().zip(landed.into_iter().flatten()) {
                 let p = cloud.positions[index as usize];
-                self.lines
-                    .extend(meetings.iter().flatten().map(|m| Sighting {
-                        line: line_point(p, m),
-                        distance: m.position.length() / surface.scale.spacing_mm,
-                    }));
+                for met in meetings.iter().flatten() {
+                    let distance = met.position.length() / surface.scale.spacing_mm;
+                    self.lines.add(line_point(p, met), distance);
+                }
                 let Some(nearest) = nearest else {
                     put(Landed {
                         index,

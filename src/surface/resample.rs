@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use super::bulk::{Reconstruction, reconstruct};
 use super::lines::Grid;
 use super::{Place, Scale, Settings, Surface, SurfaceError};
+use crate::points::spacing::widest_gap;
 use crate::points::{Neighbors, PointCloud};
 
 /// More new points than this are not made.
@@ -109,6 +110,27 @@ fn fill(surface: &Surface, apart: f64, (grid, out): (&mut Grid<()>, &mut Resampl
     }
 }
 
+/// Neighbours among which a new point must lie.
+const AMONG: usize = 24;
+
+/// The widest angle without data around a new point on a face, rad. On an edge half of the directions have none, and chance leaves more of
+/// them empty; where a face runs on beyond its edge, by half a spacing or more, it is wider than this.
+const GAP_MOST: f64 = 220.0 * std::f64::consts::PI / 180.0;
+
+/// Whether the data that lies on the tangent plane at `at` surrounds it; a face is not believed to run on beyond its points.
+fn is_among_data(surface: &Surface, at: DVec3, normal: DVec3) -> bool {
+    let mut found = Vec::new();
+    surface.neighbors.get().nearest(at, AMONG, &mut found);
+    let (u, v) = normal.any_orthonormal_pair();
+    let tolerance = 3.0 * surface.scale.noise_mm + surface.scale.floor_mm();
+    let mut angles: Vec<f64> = (found.iter())
+        .map(|(i, _)| surface.positions[*i as usize] - at)
+        .filter(|d| d.dot(normal).abs() < tolerance + 0.15 * d.length())
+        .map(|d| d.dot(v).atan2(d.dot(u)))
+        .collect();
+    angles.len() > 3 && widest_gap(&mut angles) < GAP_MOST
+}
+
 /// Six places around `p` on the surface.
 fn around(surface: &Surface, p: DVec3, normal: Vec3, apart: f64) -> Vec<(DVec3, Vec3, Place)> {
     let (u, v) = normal
@@ -121,7 +143,9 @@ fn around(surface: &Surface, p: DVec3, normal: Vec3, apart: f64) -> Vec<(DVec3, 
             let start = p + (u * cosine + v * sine) * (1.05 * apart);
             let at = surface.project(start)?;
             let near = at.position.distance(start) < apart;
-            near.then(|| (at.position, at.normals[0].as_vec3(), at.place))
+            let is_believed = near
+                && (at.place != Place::Face || is_among_data(surface, at.position, at.normals[0]));
+            is_believed.then(|| (at.position, at.normals[0].as_vec3(), at.place))
         })
         .collect()
 }

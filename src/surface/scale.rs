@@ -63,19 +63,20 @@ impl Scale {
 
     /// Supporting points of the small neighbourhoods that robust normals come from.
     pub(crate) fn points_near(&self) -> usize {
-        (self.points / 2).max(16)
+        (self.points * 3 / 5).max(16)
     }
 
     /// Supporting points among which the flanks around a point are told apart.
     pub(crate) fn points_wide(&self) -> usize {
-        self.points + self.points / 2
+        self.points * 9 / 5
     }
 }
 
 /// Points of one projection for a ratio of noise to spacing: enough that a quadric's height at the centre has a third of the noise at a
-/// ratio of 0.1, more where there is more, fewer where nothing needs to be averaged.
+/// ratio of 0.1, more where there is more, fewer where nothing needs to be averaged. Above a ratio of 0.8 no edge is left to be seen.
 fn points_for(ratio: f64) -> usize {
-    (26.0 + 180.0 * ratio.clamp(0.0, 0.4) + 150.0 * (ratio.min(0.4) - 0.15).max(0.0)) as usize
+    let ratio = ratio.clamp(0.0, 0.8);
+    (22.0 + 150.0 * ratio + 150.0 * (ratio - 0.15).max(0.0)) as usize
 }
 
 /// Indices of the points that support the surface, in the order of `neighbors`: no two closer than `distance_mm`.

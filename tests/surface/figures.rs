@@ -39,6 +39,8 @@ pub struct Figures {
     /// Rms and largest distance of the feature line samples to the true edges.
     pub line_rms: f64,
     pub line_worst: f64,
+    /// Part of the samples farther than one spacing from every true edge.
+    pub line_false: f64,
     pub lines: usize,
 }
 
@@ -180,6 +182,8 @@ impl Trial {
             normal_edge_measured: mean(&normals, true, true),
             line_rms: (lines.iter().map(|d| d * d).sum::<f64>() / lines.len().max(1) as f64).sqrt(),
             line_worst: lines.iter().copied().fold(0.0, f64::max),
+            line_false: lines.iter().filter(|d| **d > 1.0).count() as f64
+                / lines.len().max(1) as f64,
             lines: lines.len(),
         }
     }
