@@ -120,6 +120,62 @@ fn the_corners_of_a_cube_are_corners() {
 }
 
 #[test]
+fn corners_are_where_three_faces_meet_under_noise_too_and_not_along_round_edges() {
+    let sampled = solids::cube(10.0).sample(10_000, 0.1, 5);
+    let classes = found(&sampled).classes;
+    let corners: Vec<DVec3> = (0..8)
+        .map(|i| DVec3::new(sign(i & 1), sign(i & 2), sign(i & 4)))
+        .collect();
+    let marked: Vec<DVec3> = (sampled.points.iter().zip(&classes))
+        .filter(|(_, c)| **c == Class::Corner)
+        .map(|(p, _)| *p)
+        .collect();
+    let s = sampled.spacing;
+    let seen = corners
+        .iter()
+        .filter(|c| marked.iter().any(|p| p.distance(**c) < 2.0 * s));
+    // One corner may lie in a gap of the random sampling.
+    assert!(seen.clone().count() >= 7, "{} of 8 corners", seen.count());
+    for p in &marked {
+        let near = corners.iter().any(|c| c.distance(*p) < 3.0 * s);
+        assert!(near, "no corner within three spacings of {p}");
+    }
+
+    // Rims of five spacings' radius, as round as edges come that can be told.
+    let solid = solids::cylinder(5.0, 15.0);
+    let round = solid.sample(solid.area() as usize, 0.1, 7);
+    let classes = found(&round);
+    assert!(classes.count(Class::Edge) > 50, "the rims are found");
+    assert_eq!(classes.count(Class::Corner), 0, "a rim has no corner");
+}
+
+/// Half a side of the cube of ten, on the side that the bit tells.
+fn sign(bit: i32) -> f64 {
+    if bit == 0 { -5.0 } else { 5.0 }
+}
+
+#[test]
+fn cones_have_a_rim_and_a_tip_and_nothing_between() {
+    let solid = solids::cone(20.0, 40.0);
+    let sampled = solid.sample(solid.area() as usize, 0.1, 7);
+    let classes = found(&sampled).classes;
+    let tip = DVec3::Z * 20.0;
+    let (mut between, mut at_tip) = (0, 0);
+    for (p, class) in sampled.points.iter().zip(&classes) {
+        let rim = distance(&sampled.edges, *p) < 2.0;
+        if p.distance(tip) < 2.0 {
+            at_tip += usize::from(*class == Class::Corner);
+        } else if !rim && clouds::score::is_edge(class) {
+            between += 1;
+        }
+    }
+    assert!(at_tip > 0, "the tip is a corner");
+    // Of 2,700 points on the mantle; within five spacings of the tip its radius of curvature is below two and a half.
+    assert!(between <= 5, "{between} points between rim and tip");
+    reaches("cone", &sampled, 0.95);
+}
+
+#[test]
 fn order_and_place_of_the_points_do_not_change_the_answer() {
     let sampled = solids::block().sample(20_000, 0.1, 9);
     let classes = found(&sampled).classes;

@@ -39,6 +39,13 @@ const TIP_REACH: f64 = 4.0;
 const FAINT: f64 = 0.35;
 /// Standard deviations of a neighbourhood's bend from which on it is a candidate.
 const SURE: f64 = 3.0;
+/// Witnesses in turn taken as reference for all.
+const REFERENCES: usize = 8;
+/// Farthest foot, in spacings, of an edge that may cross another at a place; an edge of five spacings' radius turns by 28 degrees from one
+/// such foot to the other.
+const CROSSING_REACH: f64 = 1.2;
+/// Cosine of the angle, 37 degrees, from which on two edges cross.
+const PARALLEL: f64 = 0.8;
 /// Share of the neighbours that must see an edge for it to be believed.
 const AGREEMENT: f64 = 0.45;
 
@@ -274,9 +281,20 @@ impl Places<'_> {
         let thin = self.thin_mm / self.spacing_mm;
         let witnesses = &witnesses[..around.len()];
         let mut best: Option<Agreed> = None;
-        for (foot, sight) in witnesses.iter().filter_map(|w| w.sight).take(8) {
+        let (mut passing, mut passes) = ([DVec3::ZERO; REFERENCES], 0);
+        let mut crossing: Option<f64> = None;
+        for (foot, sight) in witnesses.iter().filter_map(|w| w.sight).take(REFERENCES) {
             let (share, at) = fit_feet(witnesses, (foot, sight.tangent), unit);
             let distance = at.length() / (thin - (sight.sd_mm / unit).min(0.2));
+            // An edge that ends at a corner is seen from one side of it only.
+            if share >= 0.6 * AGREEMENT && distance < 1.0 && foot.length() < CROSSING_REACH {
+                let others = &passing[..passes];
+                if others.iter().any(|t| t.dot(sight.tangent).abs() < PARALLEL) {
+                    crossing = Some(crossing.map_or(distance, |c| c.min(distance)));
+                }
+                passing[passes] = sight.tangent;
+                passes += 1;
+            }
             if share >= AGREEMENT && best.is_none_or(|b| distance < b.distance) {
                 best = Some(Agreed {
                     distance,
@@ -285,7 +303,8 @@ impl Places<'_> {
             }
         }
         let mut agreed = best?;
-        agreed.corner_distance = self.corner(around, sights, (p, unit)).map(|d| d / thin);
+        let seen = self.corner(around, sights, (p, unit)).map(|d| d / thin);
+        agreed.corner_distance = seen.or(crossing);
         Some(agreed)
     }
 
