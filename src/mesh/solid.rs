@@ -3,7 +3,7 @@
 //! We differ: where umbrellas do not match, the thesis leaves holes (Ma 2011, §3.4). Here every umbrella says which of the cells around its
 //! vertex lie on its two sides; neighbours are brought to one sense; every cell takes the side that its four corners say it is on.
 //! The facets between inside and outside are closed whatever the cells say, never cross one another, and agree with all umbrellas that
-//! match. What is left to mend are vertices around which inside and outside are not one piece each, and [`mend`] turns cells until there are none.
+//! match. What is left to mend are vertices around which inside and outside are not one piece each, and [`super::mend`] turns cells until there are none.
 
 use std::collections::HashMap;
 
@@ -242,146 +242,6 @@ fn inward(
         .collect()
 }
 
-/// How the mending went.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Mending {
-    /// Vertices around which inside and outside were not one piece each, before.
-    pub before: usize,
-    /// And after.
-    pub after: usize,
-    /// Cells turned on the way.
-    pub turns: usize,
-}
-
-/// Room for the look around one vertex.
-#[derive(Default)]
-pub(super) struct Ring {
-    parent: Vec<u16>,
-}
-
-/// How far the cells around `v` are from one piece inside and one outside: 0 where they are.
-pub(super) fn defect(delaunay: &Delaunay, stars: &Stars, inside: &[bool], v: u32, ring: &mut Ring) -> u32 {
-    let star = stars.of(v);
-    let parent = &mut ring.parent;
-    parent.clear();
-    parent.extend(0..star.len() as u16);
-    let of = |parent: &mut Vec<u16>, mut i: u16| {
-        while parent[i as usize] != i {
-            parent[i as usize] = parent[parent[i as usize] as usize];
-            i = parent[i as usize];
-        }
-        i
-    };
-    let (mut in_pieces, mut out_pieces) = (0u32, 0u32);
-    for code in star {
-        if inside[(code >> 2) as usize] { in_pieces += 1 } else { out_pieces += 1 }
-    }
-    for (i, code) in star.iter().enumerate() {
-        let (cell, own) = corner(*code);
-        let is_in = inside[cell as usize];
-        for at in (0..4).filter(|at| *at != own) {
-            let n = delaunay.neighbors[cell as usize][at];
-            if n < cell || inside[n as usize] != is_in {
-                continue;
-            }
-            let j = star.partition_point(|c| c >> 2 < n);
-            let (a, b) = (of(parent, i as u16), of(parent, j as u16));
-            if a != b {
-                parent[a.max(b) as usize] = a.min(b);
-                if is_in { in_pieces -= 1 } else { out_pieces -= 1 }
-            }
-        }
-    }
-    in_pieces.abs_diff(1) + out_pieces.abs_diff(1)
-}
-
-/// Turns cells from inside to outside and back until around every vertex inside and outside are one piece each, as far as it goes.
-///
-/// A search among the vertices that are wrong: of all cells around one, that is turned which leaves the fewest wrong and the smallest facets;
-/// a turned cell rests a while, so that the search leaves blind alleys. One thread; the order is that of the vertices.
-pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Solid) -> Mending {
-    let count = delaunay.points.len() as u32;
-    let mut defects: Vec<u8> = (0..count)
-        .into_par_iter()
-        .map_init(Ring::default, |ring, v| defect(delaunay, stars, &solid.inside, v, ring).min(255) as u8)
-        .collect();
-    let mut queue: std::collections::VecDeque<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
-    let before = queue.len();
-    let mut rests: HashMap<u32, usize> = HashMap::new();
-    let most = 2000;
-    let mut ring = Ring::default();
-    let mut turns = 0;
-    while let Some(v) = queue.pop_front() {
-        if defects[v as usize] == 0 {
-            continue;
-        }
-        if turns >= most {
-            break;
-        }
-        let mut best: Option<(i32, f32, u32)> = None;
-        for code in stars.of(v) {
-            let cell = code >> 2;
-            let corners = delaunay.cells[cell as usize];
-            let rests = rests.get(&cell).is_some_and(|until| *until > turns);
-            if corners.contains(&GHOST) || rests {
-                continue;
-            }
-            let inside = solid.inside[cell as usize];
-            let borders = (0..4).any(|at| solid.inside[delaunay.neighbors[cell as usize][at] as usize] != inside);
-            if !borders {
-                continue;
-            }
-            solid.inside[cell as usize] = !inside;
-            let change: i32 = corners
-                .iter()
-                .map(|c| {
-                    defect(delaunay, stars, &solid.inside, *c, &mut ring) as i32
-                        - i32::from(defects[*c as usize])
-                })
-                .sum();
-            solid.inside[cell as usize] = inside;
-            let cost = cost_of_turning(delaunay, facets, solid, cell);
-            let is_better = best.is_none_or(|(c, w, _)| change < c || (change == c && cost < w));
-            if is_better {
-                best = Some((change, cost, cell));
-            }
-        }
-        if let Some((_, _, cell)) = best {
-            turns += 1;
-            solid.inside[cell as usize] ^= true;
-            // Long enough to leave a group of some cells, short against the length of the search.
-            rests.insert(cell, turns + 20);
-            for c in delaunay.cells[cell as usize] {
-                let now = defect(delaunay, stars, &solid.inside, c, &mut ring).min(255) as u8;
-                defects[c as usize] = now;
-                if now > 0 && c != v {
-                    queue.push_back(c);
-                }
-            }
-        }
-        if defects[v as usize] > 0 && best.is_some() {
-            queue.push_back(v);
-        }
-    }
-    Mending {
-        before,
-        after: defects.iter().filter(|d| **d > 0).count(),
-        turns,
-    }
-}
-
-/// How much turning a cell adds to the size of the surface's facets, less what its corners' votes say against its present side.
-fn cost_of_turning(delaunay: &Delaunay, facets: &Facets, solid: &Solid, cell: u32) -> f32 {
-    let inside = solid.inside[cell as usize];
-    (0..4)
-        .map(|at| {
-            let n = delaunay.neighbors[cell as usize][at];
-            let radius = facets.radius(cell, at).min(1e30);
-            if solid.inside[n as usize] == inside { radius } else { -radius }
-        })
-        .sum()
-}
-
 /// The triangles between inside and outside, seen from outside counter-clockwise, as vertices of `delaunay`, in order of the cells.
 pub fn surface(delaunay: &Delaunay, inside: &[bool]) -> Vec<[u32; 3]> {
     let mut triangles = Vec::with_capacity(2 * delaunay.points.len());
@@ -398,4 +258,25 @@ pub fn surface(delaunay: &Delaunay, inside: &[bool]) -> Vec<[u32; 3]> {
         }
     }
     triangles
+}
+
+/// Turns cells of which their corners are not sure where sizes speak for it: before any vertex is looked at.
+pub fn settle(delaunay: &Delaunay, facets: &Facets, solid: &mut Solid) {
+    /// Votes up to this are no majority of four matched corners.
+    const UNSURE: i8 = 2;
+    let unsure: Vec<u32> = (0..delaunay.cells.len() as u32)
+        .filter(|c| (-UNSURE..=UNSURE).contains(&solid.votes[*c as usize]))
+        .collect();
+    for _ in 0..4 {
+        let mut turned = false;
+        for &cell in &unsure {
+            if super::mend::cost_of_turning(delaunay, facets, solid, cell) < -1e-3 {
+                solid.inside[cell as usize] ^= true;
+                turned = true;
+            }
+        }
+        if !turned {
+            break;
+        }
+    }
 }

@@ -9,7 +9,8 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::delaunay::{Delaunay, FACETS, GHOST};
-use super::star::{Facets, Stars, corner, facet};
+use super::cone::Cones;
+use super::star::{Facets, Stars, corner, facet, vertices};
 
 /// Rounds of matching after which what is not matched stays so; the author's slowest took 11.
 const MOST_ROUNDS: usize = 40;
@@ -55,6 +56,9 @@ struct Work<'a> {
     stars: &'a Stars,
     facets: &'a Facets,
     axes: &'a [Vec3],
+    /// Which vertices are not fully matched.
+    is_open: &'a [bool],
+    cones: Option<&'a Cones>,
 }
 
 /// Which facets an umbrella is picked from, and in what order.
@@ -66,33 +70,49 @@ pub enum Queue {
     Matching,
     /// All; by matching index, then by size, which all vertices see alike.
     Settling,
+    /// All; matched ones and those within the normal vector cone, then as [`Queue::Matching`] (Ma 2011, §5.4.2).
+    Cone,
 }
 
 /// Finds the umbrellas of all vertices, and leaves them as marks on `facets`.
 ///
 /// All vertices choose at once from what all had chosen before, so the result does not depend on the number of threads. Ends when all are matched,
 /// nothing changes, or after 40 rounds: where data are noisy or too sparse some vertices change their minds for ever.
-pub fn match_umbrellas(delaunay: &Delaunay, stars: &Stars, facets: &Facets) -> Matching {
+pub fn match_umbrellas(delaunay: &Delaunay, stars: &Stars, facets: &Facets, with_cone: bool) -> Matching {
     let mut active: Vec<u32> = (0..delaunay.points.len() as u32).collect();
     let total = active.len();
     let axes = axes(delaunay, stars);
-    let work = Work { delaunay, stars, facets, axes: &axes };
+    let mut is_open = vec![true; total];
+    let mut cones = None;
     let mut matching = Matching::default();
     let mut queue = Queue::Initial;
     for _ in 0..=MOST_ROUNDS {
+        if queue == Queue::Cone && cones.is_none() {
+            cones = Some(Cones::new(delaunay, stars, facets, &axes, &is_open));
+        }
+        let work = Work {
+            delaunay,
+            stars,
+            facets,
+            axes: &axes,
+            is_open: &is_open,
+            cones: cones.as_ref(),
+        };
         choose(&work, &active, queue);
         let before = active.len();
-        let is_open = |v: &u32| !is_matched(delaunay, stars, facets, *v);
-        active = active.into_par_iter().filter(is_open).collect();
+        let is_still_open = |v: &u32| !is_matched(delaunay, stars, facets, *v);
+        let still: Vec<u32> = active.par_iter().copied().filter(is_still_open).collect();
+        active.iter().for_each(|v| is_open[*v as usize] = false);
+        still.iter().for_each(|v| is_open[*v as usize] = true);
+        active = still;
         matching.matched.push(total - active.len());
-        if active.is_empty() {
-            break;
-        }
         // A round that matches less than one in fifty of the rest is followed by none that matches more.
         let pays = before - active.len() > before / 50;
         queue = match queue {
+            _ if active.is_empty() => break,
             Queue::Initial => Queue::Matching,
-            Queue::Matching if !pays => Queue::Settling,
+            Queue::Matching if !pays && with_cone => Queue::Cone,
+            Queue::Matching | Queue::Cone if !pays => Queue::Settling,
             Queue::Settling if !pays => break,
             other => other,
         };
@@ -122,6 +142,56 @@ pub fn facets_at<'a>(
             (at != own && is_first && !ghostly).then_some((cell << 2 | at as u32, cell, at))
         })
     })
+}
+
+/// A facet of an umbrella: its place, and its other two corners in the sense of the ring.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Panel {
+    /// The facet.
+    pub facet: u32,
+    /// Its corner that it shares with the panel before.
+    pub from: u32,
+    /// Its corner that it shares with the panel after.
+    pub to: u32,
+}
+
+/// The umbrella of `v` in the order of its ring, into `ring`; the normals (from - v) x (to - v) then agree, with `axis` on the whole.
+pub fn umbrella(
+    delaunay: &Delaunay,
+    stars: &Stars,
+    facets: &Facets,
+    (v, axis): (u32, DVec3),
+    ring: &mut Vec<Panel>,
+) {
+    ring.clear();
+    for (f, ..) in facets_at(delaunay, stars, v) {
+        if facets.is_in_umbrella_of(delaunay, f, v) {
+            let [a, b, c] = vertices(delaunay, f);
+            let (from, to) = if a == v { (b, c) } else if b == v { (c, a) } else { (a, b) };
+            ring.push(Panel { facet: f, from, to });
+        }
+    }
+    for i in 1..ring.len() {
+        let end = ring[i - 1].to;
+        let Some(next) = (i..ring.len()).find(|j| ring[*j].from == end || ring[*j].to == end) else {
+            break;
+        };
+        ring.swap(i, next);
+        if ring[i].from != end {
+            let Panel { facet, from, to } = ring[i];
+            ring[i] = Panel { facet, from: to, to: from };
+        }
+    }
+    let p = delaunay.points[v as usize];
+    let at = |u: u32| delaunay.points[u as usize] - p;
+    let sum: DVec3 = ring.iter().map(|s| at(s.from).cross(at(s.to))).sum();
+    if sum.dot(axis) < 0.0 {
+        ring.reverse();
+        for panel in ring.iter_mut() {
+            let Panel { facet, from, to } = *panel;
+            *panel = Panel { facet, from: to, to: from };
+        }
+    }
 }
 
 /// Lets all `active` vertices choose.
@@ -164,7 +234,11 @@ impl Bench {
     }
 
     fn collect(&mut self, work: &Work, v: u32, queue: Queue) {
-        let Work { delaunay, stars, facets, axes } = *work;
+        let Work { delaunay, stars, facets, axes, .. } = *work;
+        let cone = match (queue, work.cones) {
+            (Queue::Cone, Some(cones)) => cones.of(delaunay, stars, facets, v, axes[v as usize].as_dvec3(), work.is_open),
+            _ => None,
+        };
         self.spokes.clear();
         self.around.clear();
         for (facet, cell, at) in facets_at(delaunay, stars, v) {
@@ -175,6 +249,16 @@ impl Bench {
                     2 * facets.matches(facet) as u8 + u8::from(own)
                 }
                 Queue::Settling => facets.matches(facet) as u8,
+                Queue::Cone => {
+                    let matches = facets.matches(facet) as u8;
+                    let own = facets.is_in_umbrella_of(delaunay, facet, v);
+                    let holds = || {
+                        let radius = facets.radius(cell, at);
+                        cone.as_ref().is_some_and(|c| c.holds(delaunay, facet, radius))
+                    };
+                    let first = matches == 3 || holds();
+                    8 * u8::from(first) + 2 * matches + u8::from(own)
+                }
             };
             let corners = delaunay.cells[cell as usize];
             let mut ends = (0..4).filter(|k| *k != at && corners[*k] != v).map(|k| corners[k]);
@@ -357,23 +441,3 @@ pub fn sides(delaunay: &Delaunay, stars: &Stars, facets: &Facets) -> (Vec<u8>, V
     (bits.into_iter().map(AtomicU8::into_inner).collect(), two_sided)
 }
 
-/// debug
-pub fn stats(delaunay: &Delaunay, stars: &Stars, facets: &Facets) {
-    let mut hist = std::collections::BTreeMap::new();
-    for v in 0..delaunay.points.len() as u32 {
-        let p = delaunay.points[v as usize];
-        let fs: Vec<u32> = facets_at(delaunay, stars, v).filter(|(f, ..)| facets.is_in_umbrella_of(delaunay, *f, v)).map(|f| f.0).collect();
-        let matched = fs.iter().all(|f| facets.matches(*f) == 3);
-        let mut edges: Vec<[u32; 2]> = fs.iter().map(|f| { let t = super::star::vertices(delaunay, *f); let mut e = t.into_iter().filter(|x| *x != v); [e.next().unwrap(), e.next().unwrap()] }).collect();
-        // walk
-        let mut ring = vec![edges[0][0]];
-        let mut cur = edges[0][1]; edges.remove(0);
-        while !edges.is_empty() { ring.push(cur); let i = edges.iter().position(|e| e.contains(&cur)).unwrap(); let e = edges.remove(i); cur = if e[0] == cur { e[1] } else { e[0] }; }
-        let n: Vec<_> = (0..ring.len()).map(|i| (delaunay.points[ring[i] as usize] - p).cross(delaunay.points[ring[(i + 1) % ring.len()] as usize] - p).normalize_or_zero()).collect();
-        let worst = (0..n.len()).map(|i| n[i].dot(n[(i + 1) % n.len()])).fold(1.0, f64::min);
-        let angle: f64 = (0..ring.len()).map(|i| (delaunay.points[ring[i] as usize] - p).angle_between(delaunay.points[ring[(i + 1) % ring.len()] as usize] - p)).sum();
-        let key = (matched, worst < 0.0, (angle / 1.0).floor() as i32);
-        *hist.entry(key).or_insert(0) += 1;
-    }
-    for (k, n) in hist { println!("   matched {} folded {} angle {} : {n}", k.0, k.1, k.2); }
-}
