@@ -23,14 +23,14 @@ pub struct Solid {
 }
 
 /// Sets of vertices whose umbrellas have been brought to one sense.
-struct Senses {
+pub(super) struct Senses {
     parent: Vec<u32>,
     /// Whether a vertex has the other sense than its parent.
     turned: Vec<bool>,
 }
 
 impl Senses {
-    fn new(count: usize) -> Self {
+    pub fn new(count: usize) -> Self {
         Self {
             parent: (0..count as u32).collect(),
             turned: vec![false; count],
@@ -38,7 +38,7 @@ impl Senses {
     }
 
     /// The vertex that stands for the set, and whether `v` has the other sense.
-    fn of(&mut self, v: u32) -> (u32, bool) {
+    pub fn of(&mut self, v: u32) -> (u32, bool) {
         let (mut root, mut turned) = (v, false);
         while self.parent[root as usize] != root {
             turned ^= self.turned[root as usize];
@@ -57,7 +57,7 @@ impl Senses {
     }
 
     /// Joins the sets of two vertices that have the `other` sense than each other, or the same.
-    fn join(&mut self, a: u32, b: u32, other: bool) {
+    pub fn join(&mut self, a: u32, b: u32, other: bool) {
         let ((a, a_turned), (b, b_turned)) = (self.of(a), self.of(b));
         if a != b {
             let (low, high) = (a.min(b), a.max(b));
@@ -251,9 +251,8 @@ pub fn surface(delaunay: &Delaunay, inside: &[bool]) -> Vec<[u32; 3]> {
         }
         for at in 0..4 {
             if !inside[delaunay.neighbors[cell][at] as usize] {
-                // Facets are seen from the inside of their cell counter-clockwise or not? See the test.
-                let [a, b, c] = super::delaunay::FACETS[at].map(|k| delaunay.cells[cell][k]);
-                triangles.push([a, c, b]);
+                // From its own cell a facet's corners are seen clockwise, so from outside they are not.
+                triangles.push(super::delaunay::FACETS[at].map(|k| delaunay.cells[cell][k]));
             }
         }
     }
