@@ -13,6 +13,7 @@ pub mod normals;
 mod open;
 pub mod picture;
 mod predicates;
+pub mod sharpen;
 pub mod solid;
 pub mod star;
 pub mod umbrella;
@@ -138,6 +139,10 @@ impl Body {
         lap("inside");
         let mending = mend(&delaunay, &stars, &facets, &mut solid);
         lap("mend");
+        if settings.cone {
+            sharpen::sharpen(&delaunay, &stars, &mut solid.inside);
+        }
+        lap("sharpen");
         Ok(Self {
             delaunay,
             stars,

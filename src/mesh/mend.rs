@@ -153,6 +153,9 @@ impl Search<'_> {
             }
             wrong.sort_unstable();
             wrong.dedup();
+            if sum < best_sum {
+                (best_sum, best_length) = (sum, self.journal.len());
+            }
         }
         for step in 0..steps {
             wrong.retain(|w| self.defects[*w as usize] > 0);
