@@ -73,12 +73,18 @@ pub struct Mesh {
 impl Mesh {
     /// Share of the vertices, in percent, around which the mesh has one closed ring of triangles: a fully matched umbrella (Ma 2011, §3.4).
     pub fn matched_percent(&self) -> f64 {
-        percent(self.positions.len() - self.mending.after.min(self.positions.len()), self.positions.len())
+        percent(
+            self.positions.len() - self.mending.after.min(self.positions.len()),
+            self.positions.len(),
+        )
     }
 
     /// The same by matching alone, before cells were turned.
     pub fn matched_by_umbrellas_percent(&self) -> f64 {
-        percent(self.matching.matched.last().copied().unwrap_or(0), self.positions.len())
+        percent(
+            self.matching.matched.last().copied().unwrap_or(0),
+            self.positions.len(),
+        )
     }
 
     /// |2 V + 4 (G - B) - F| for B pieces with G handles together (Ma 2011, equation 3.2, where B is 1); G is taken as 0 where the mesh
@@ -172,7 +178,13 @@ impl Body {
             .map(|t| {
                 let [a, b, c] = t.map(|v| numbers[v as usize]);
                 // Begun with the lowest: the mesh is the same whatever the order of the cells.
-                if a < b && a < c { [a, b, c] } else if b < c { [b, c, a] } else { [c, a, b] }
+                if a < b && a < c {
+                    [a, b, c]
+                } else if b < c {
+                    [b, c, a]
+                } else {
+                    [c, a, b]
+                }
             })
             .collect();
         triangles.sort_unstable();

@@ -120,7 +120,13 @@ impl Mesh {
             let text = serde_json::to_string(summary).map_err(|e| Failure::Internal(e.into()))?;
             return print_line(&text);
         }
-        let yes = |is: bool, what: &str| if is { what.to_owned() } else { format!("not {what}") };
+        let yes = |is: bool, what: &str| {
+            if is {
+                what.to_owned()
+            } else {
+                format!("not {what}")
+            }
+        };
         print_line(&format!(
             "{} vertices, {} triangles in {} pieces: {}, {}, {:.2} % matched",
             summary.vertices,

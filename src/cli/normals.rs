@@ -87,8 +87,9 @@ impl NormalsCommand {
         let start = Instant::now();
         let found = match self.method {
             MethodName::Umbrella => {
-                let body = Body::new(positions, Settings::default())
-                    .map_err(|error| Failure::BadInput(anyhow!("{}: {error}", self.scan.display())))?;
+                let body = Body::new(positions, Settings::default()).map_err(|error| {
+                    Failure::BadInput(anyhow!("{}: {error}", self.scan.display()))
+                })?;
                 seconds.extend(body.seconds.iter().copied());
                 let found = normals(&body, &scan.cloud, &neighbors, Rings::Auto);
                 rings = Some(if found.rings == Rings::Two { 2 } else { 1 });
@@ -109,7 +110,11 @@ impl NormalsCommand {
         if let Some(path) = &self.output {
             let part = |axis: usize| found.iter().map(|n| f64::from(n[axis])).collect();
             let [nx, ny, nz]: [Vec<f64>; 3] = [part(0), part(1), part(2)];
-            let columns = [Column::F64("nx", &nx), Column::F64("ny", &ny), Column::F64("nz", &nz)];
+            let columns = [
+                Column::F64("nx", &nx),
+                Column::F64("ny", &ny),
+                Column::F64("nz", &nz),
+            ];
             write_ply(path, positions, &columns, Encoding::LittleEndian)
                 .map_err(|e| Failure::Io(e.into()))?;
         }

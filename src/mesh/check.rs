@@ -36,7 +36,9 @@ pub fn check_delaunay(delaunay: &Delaunay) -> Result<(), String> {
     edges.dedup();
     let (v, e, c) = (delaunay.points.len() + 1, edges.len(), delaunay.cells.len());
     if v + c != e {
-        return Err(format!("Euler: {v} vertices, {e} edges, {c} cells: V + C - E is not 0"));
+        return Err(format!(
+            "Euler: {v} vertices, {e} edges, {c} cells: V + C - E is not 0"
+        ));
     }
     Ok(())
 }
@@ -58,7 +60,9 @@ fn check_cell(delaunay: &Delaunay, signs: &Signs, cell: u32) -> Result<(), Strin
         let neighbor = delaunay.neighbors[cell as usize][k];
         let mirror = delaunay.mirror(cell, neighbor);
         if delaunay.neighbors[neighbor as usize][mirror] != cell {
-            return Err(format!("cell {cell}: its neighbour {neighbor} does not know it"));
+            return Err(format!(
+                "cell {cell}: its neighbour {neighbor} does not know it"
+            ));
         }
         let mut own = FACETS[k].map(|f| corners[f]);
         let other = delaunay.cells[neighbor as usize];
@@ -66,7 +70,9 @@ fn check_cell(delaunay: &Delaunay, signs: &Signs, cell: u32) -> Result<(), Strin
         own.sort_unstable();
         its.sort_unstable();
         if own != its {
-            return Err(format!("cells {cell} and {neighbor}: facets {own:?} and {its:?} differ"));
+            return Err(format!(
+                "cells {cell} and {neighbor}: facets {own:?} and {its:?} differ"
+            ));
         }
         let across = other[mirror];
         if across == GHOST {
@@ -78,13 +84,17 @@ fn check_cell(delaunay: &Delaunay, signs: &Signs, cell: u32) -> Result<(), Strin
                     return Err(format!("cell {cell}: vertex {across} lies in its sphere"));
                 }
                 if signs.in_sphere_perturbed(corners.map(at), at(across)) {
-                    return Err(format!("cell {cell}: vertex {across} lies in its perturbed sphere"));
+                    return Err(format!(
+                        "cell {cell}: vertex {across} lies in its perturbed sphere"
+                    ));
                 }
             }
             Some(g) if g != k => {
                 let [a, b, c] = FACETS[g].map(|f| at(corners[f]));
                 if signs.orient(a, b, c, at(across)) > 0.0 {
-                    return Err(format!("ghost {cell}: the hull is not convex at vertex {across}"));
+                    return Err(format!(
+                        "ghost {cell}: the hull is not convex at vertex {across}"
+                    ));
                 }
             }
             Some(_) => {}
@@ -254,7 +264,10 @@ mod tests {
         let mut two = one.to_vec();
         two.extend(one.map(|t| t.map(|v| if v == 0 { 0 } else { v + 3 })));
         let seen = topology(7, &two);
-        assert_eq!((seen.bad_vertices, seen.bad_edges, seen.open_edges), (1, 0, 0));
+        assert_eq!(
+            (seen.bad_vertices, seen.bad_edges, seen.open_edges),
+            (1, 0, 0)
+        );
         assert!(seen.is_watertight() && !seen.is_manifold());
 
         let seen = topology(4, &one[1..]);

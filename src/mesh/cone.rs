@@ -45,8 +45,17 @@ impl Cones {
             if is_open[v as usize] {
                 return -1.0;
             }
-            umbrella(delaunay, stars, facets, (v, axes[v as usize].as_dvec3()), ring);
-            let normals: Vec<DVec3> = ring.iter().map(|panel| normal(delaunay, v, panel)).collect();
+            umbrella(
+                delaunay,
+                stars,
+                facets,
+                (v, axes[v as usize].as_dvec3()),
+                ring,
+            );
+            let normals: Vec<DVec3> = ring
+                .iter()
+                .map(|panel| normal(delaunay, v, panel))
+                .collect();
             let sum: f64 = (0..normals.len())
                 .map(|i| normals[i].angle_between(normals[(i + 1) % normals.len()]))
                 .filter(|angle| angle.is_finite())
@@ -73,27 +82,42 @@ impl Cones {
         let mut ring = Vec::new();
         umbrella(delaunay, stars, facets, (v, axis), &mut ring);
         let p = delaunay.points[v as usize];
-        let panels: Vec<(Panel, DVec3)> = ring.iter().map(|s| (*s, normal(delaunay, v, s))).collect();
+        let panels: Vec<(Panel, DVec3)> =
+            ring.iter().map(|s| (*s, normal(delaunay, v, s))).collect();
         // Matched facets at a matched neighbour: behind them the surface is finished.
         let is_firm = |s: &Panel| {
             facets.matches(s.facet) == 3 && !(is_open[s.from as usize] && is_open[s.to as usize])
         };
-        let firm: Vec<DVec3> = panels.iter().filter(|(s, _)| is_firm(s)).map(|s| s.1).collect();
-        let bends = ring.iter().map(|s| self.bends[s.from as usize]).filter(|b| *b >= 0.0);
+        let firm: Vec<DVec3> = panels
+            .iter()
+            .filter(|(s, _)| is_firm(s))
+            .map(|s| s.1)
+            .collect();
+        let bends = ring
+            .iter()
+            .map(|s| self.bends[s.from as usize])
+            .filter(|b| *b >= 0.0);
         let (count, sum) = bends.fold((0, 0.0), |(n, sum), b| (n + 1, sum + f64::from(b)));
         let flat = (2.0 * sum / f64::from(count.max(1))).clamp(NARROWEST, GENERIC);
         let least = flat.cos();
-        let is_flat = count > 0 && !firm.is_empty() && firm.iter().all(|a| firm.iter().all(|b| a.dot(*b) >= least));
+        let is_flat = count > 0
+            && !firm.is_empty()
+            && firm.iter().all(|a| firm.iter().all(|b| a.dot(*b) >= least));
         let nominal: DVec3 = panels
             .iter()
             .map(|(s, n)| {
-                let (a, b) = (delaunay.points[s.from as usize] - p, delaunay.points[s.to as usize] - p);
+                let (a, b) = (
+                    delaunay.points[s.from as usize] - p,
+                    delaunay.points[s.to as usize] - p,
+                );
                 let more = if is_flat && is_firm(s) { 1.0 } else { 0.0 };
                 *n * ((f64::from(facets.matches(s.facet)) + more) * a.angle_between(b))
             })
             .filter(|n| n.is_finite())
             .sum();
-        let largest = ring.iter().map(|s| facets.radius(s.facet >> 2, (s.facet & 3) as usize));
+        let largest = ring
+            .iter()
+            .map(|s| facets.radius(s.facet >> 2, (s.facet & 3) as usize));
         Some(Cone {
             nominal: nominal.try_normalize()?,
             least_cosine: if is_flat { least } else { GENERIC.cos() },
@@ -113,6 +137,9 @@ impl Cone {
 
 fn normal(delaunay: &Delaunay, v: u32, panel: &Panel) -> DVec3 {
     let p = delaunay.points[v as usize];
-    let (a, b) = (delaunay.points[panel.from as usize] - p, delaunay.points[panel.to as usize] - p);
+    let (a, b) = (
+        delaunay.points[panel.from as usize] - p,
+        delaunay.points[panel.to as usize] - p,
+    );
     a.cross(b).normalize_or_zero()
 }

@@ -17,7 +17,12 @@ pub fn along_hilbert_curve(points: &[DVec3]) -> (Vec<u32>, Vec<u32>) {
     let mut keyed: Vec<(u64, u32)> = points
         .par_iter()
         .enumerate()
-        .map(|(i, p)| (hilbert(((*p - low) * steps).to_array().map(|x| x as u32)), i as u32))
+        .map(|(i, p)| {
+            (
+                hilbert(((*p - low) * steps).to_array().map(|x| x as u32)),
+                i as u32,
+            )
+        })
         .collect();
     keyed.par_sort_unstable();
     for cell in keyed.chunk_by_mut(|a, b| a.0 == b.0) {
@@ -29,7 +34,9 @@ pub fn along_hilbert_curve(points: &[DVec3]) -> (Vec<u32>, Vec<u32>) {
     let mut distinct: Vec<u32> = Vec::with_capacity(points.len());
     let mut place = vec![0; points.len()];
     for (_, i) in keyed {
-        let is_new = distinct.last().is_none_or(|last| points[*last as usize] != points[i as usize]);
+        let is_new = distinct
+            .last()
+            .is_none_or(|last| points[*last as usize] != points[i as usize]);
         if is_new {
             distinct.push(i);
         }
@@ -40,7 +47,9 @@ pub fn along_hilbert_curve(points: &[DVec3]) -> (Vec<u32>, Vec<u32>) {
 
 pub fn bounds(points: &[DVec3]) -> (DVec3, DVec3) {
     let first = points.first().copied().unwrap_or(DVec3::ZERO);
-    points.iter().fold((first, first), |(low, high), p| (low.min(*p), high.max(*p)))
+    points
+        .iter()
+        .fold((first, first), |(low, high), p| (low.min(*p), high.max(*p)))
 }
 
 /// Place of a cell of the cube along the curve (Skilling, *Programming the Hilbert curve*, 2004).
@@ -132,7 +141,10 @@ mod tests {
         let points: Vec<DVec3> = (0..300).map(|i| DVec3::splat(f64::from(i % 100))).collect();
         let (distinct, place) = along_hilbert_curve(&points);
         assert_eq!(distinct.len(), 100);
-        assert!(distinct.iter().all(|i| *i < 100), "the first of equal points");
+        assert!(
+            distinct.iter().all(|i| *i < 100),
+            "the first of equal points"
+        );
         for (i, p) in place.iter().enumerate() {
             assert_eq!(points[distinct[*p as usize] as usize], points[i]);
         }

@@ -149,7 +149,10 @@ fn place(of: &[u32; 4], what: u32) -> usize {
 fn without_extremes(positions: &[DVec3]) -> (Vec<DVec3>, f64) {
     const SMALL: f64 = 1.0 / (1u128 << 100) as f64;
     const LARGE: f64 = (1u128 << 100) as f64;
-    let largest = positions.iter().map(|p| p.abs().max_element()).fold(0.0, f64::max);
+    let largest = positions
+        .iter()
+        .map(|p| p.abs().max_element())
+        .fold(0.0, f64::max);
     let (scale, largest) = if largest == 0.0 || (SMALL..LARGE).contains(&largest) {
         (1.0, largest)
     } else {
@@ -161,9 +164,16 @@ fn without_extremes(positions: &[DVec3]) -> (Vec<DVec3>, f64) {
     let grain = 1.5 * 2f64.powi(-148) * largest.log2().ceil().max(-200.0).exp2();
     let snap = |x: f64| {
         let x = x * scale;
-        if x.abs() < 0.5 * grain { (x + grain) - grain } else { x }
+        if x.abs() < 0.5 * grain {
+            (x + grain) - grain
+        } else {
+            x
+        }
     };
-    let points = positions.iter().map(|p| DVec3::from_array(p.to_array().map(snap))).collect();
+    let points = positions
+        .iter()
+        .map(|p| DVec3::from_array(p.to_array().map(snap)))
+        .collect();
     (points, scale)
 }
 
@@ -177,12 +187,18 @@ fn first_cell(points: &[DVec3], order: &[u32]) -> Result<[u32; 4], DelaunayError
     let mut rest = order.iter().copied();
     let a = rest.next().ok_or(flat(0))?;
     let b = rest.next().ok_or(flat(0))?;
-    let c = rest.find(|&v| !collinear(at(a), at(b), at(v))).ok_or(flat(1))?;
+    let c = rest
+        .find(|&v| !collinear(at(a), at(b), at(v)))
+        .ok_or(flat(1))?;
     // Points before `c` lie on the line through `a` and `b`, so in every plane through it.
     let signs = Signs::of(points);
     let side = |v: u32| signs.orient(at(a), at(b), at(c), at(v));
     let d = rest.find(|&v| side(v) != 0.0).ok_or(flat(2))?;
-    Ok(if side(d) > 0.0 { [a, b, c, d] } else { [b, a, c, d] })
+    Ok(if side(d) > 0.0 {
+        [a, b, c, d]
+    } else {
+        [b, a, c, d]
+    })
 }
 
 /// A facet on the rim of a cavity, made into a cell with the new point.
@@ -299,14 +315,17 @@ impl Builder {
     fn falls(&self, cell: u32, p: DVec3) -> bool {
         let corners = self.cells[cell as usize];
         let Some(at) = corners.iter().position(|c| *c == GHOST) else {
-            return self.signs.in_sphere_perturbed(corners.map(|c| self.at(c)), p);
+            return self
+                .signs
+                .in_sphere_perturbed(corners.map(|c| self.at(c)), p);
         };
         let [a, b, c] = FACETS[at].map(|k| self.at(corners[k]));
         match self.signs.orient(a, b, c, p) {
             // In the plane of a hull facet the sphere of the cell behind it is the facet's circle.
             0.0 => {
                 let behind = self.cells[self.neighbors[cell as usize][at] as usize];
-                self.signs.in_sphere_perturbed(behind.map(|c| self.at(c)), p)
+                self.signs
+                    .in_sphere_perturbed(behind.map(|c| self.at(c)), p)
             }
             side => side > 0.0,
         }

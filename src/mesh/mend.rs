@@ -29,7 +29,13 @@ pub(super) struct Ring {
 }
 
 /// How far the cells around `v` are from one piece inside and one outside: 0 where they are.
-pub(super) fn defect(delaunay: &Delaunay, stars: &Stars, inside: &[bool], v: u32, ring: &mut Ring) -> u32 {
+pub(super) fn defect(
+    delaunay: &Delaunay,
+    stars: &Stars,
+    inside: &[bool],
+    v: u32,
+    ring: &mut Ring,
+) -> u32 {
     let star = stars.of(v);
     let parent = &mut ring.parent;
     parent.clear();
@@ -43,7 +49,11 @@ pub(super) fn defect(delaunay: &Delaunay, stars: &Stars, inside: &[bool], v: u32
     };
     let (mut in_pieces, mut out_pieces) = (0u32, 0u32);
     for code in star {
-        if inside[(code >> 2) as usize] { in_pieces += 1 } else { out_pieces += 1 }
+        if inside[(code >> 2) as usize] {
+            in_pieces += 1
+        } else {
+            out_pieces += 1
+        }
     }
     for (i, code) in star.iter().enumerate() {
         let (cell, own) = corner(*code);
@@ -57,7 +67,11 @@ pub(super) fn defect(delaunay: &Delaunay, stars: &Stars, inside: &[bool], v: u32
             let (a, b) = (of(parent, i as u32), of(parent, j as u32));
             if a != b {
                 parent[a.max(b) as usize] = a.min(b);
-                if is_in { in_pieces -= 1 } else { out_pieces -= 1 }
+                if is_in {
+                    in_pieces -= 1
+                } else {
+                    out_pieces -= 1
+                }
             }
         }
     }
@@ -74,7 +88,9 @@ pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Sol
     let inside = &solid.inside;
     let defects: Vec<u8> = (0..count)
         .into_par_iter()
-        .map_init(Ring::default, |ring, v| defect(delaunay, stars, inside, v, ring).min(255) as u8)
+        .map_init(Ring::default, |ring, v| {
+            defect(delaunay, stars, inside, v, ring).min(255) as u8
+        })
         .collect();
     let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
     let before = wrong.len();
@@ -180,7 +196,9 @@ impl Search<'_> {
             }
         }
         while self.journal.len() > best_length {
-            let Some(cell) = self.journal.pop() else { break };
+            let Some(cell) = self.journal.pop() else {
+                break;
+            };
             self.turn(cell);
             self.journal.pop();
         }
@@ -352,7 +370,13 @@ impl Search<'_> {
         self.solid.inside[cell as usize] ^= true;
         self.journal.push(cell);
         for c in self.delaunay.cells[cell as usize] {
-            let now = defect(self.delaunay, self.stars, &self.solid.inside, c, &mut self.ring);
+            let now = defect(
+                self.delaunay,
+                self.stars,
+                &self.solid.inside,
+                c,
+                &mut self.ring,
+            );
             self.defects[c as usize] = now.min(255) as u8;
         }
     }
@@ -362,7 +386,13 @@ impl Search<'_> {
         self.solid.inside[cell as usize] ^= true;
         let mut change = 0;
         for c in self.delaunay.cells[cell as usize] {
-            let now = defect(self.delaunay, self.stars, &self.solid.inside, c, &mut self.ring);
+            let now = defect(
+                self.delaunay,
+                self.stars,
+                &self.solid.inside,
+                c,
+                &mut self.ring,
+            );
             change += now.min(255) as i32 - i32::from(self.defects[c as usize]);
         }
         self.solid.inside[cell as usize] ^= true;
@@ -375,16 +405,24 @@ impl Search<'_> {
 }
 
 /// What speaks against turning a cell: growth of the surface's facets, in mean facets of the cell, and its corners' votes.
-pub(super) fn cost_of_turning(delaunay: &Delaunay, facets: &Facets, solid: &Solid, cell: u32) -> f32 {
+pub(super) fn cost_of_turning(
+    delaunay: &Delaunay,
+    facets: &Facets,
+    solid: &Solid,
+    cell: u32,
+) -> f32 {
     let inside = solid.inside[cell as usize];
     let (mut growth, mut sum) = (0.0, 0.0);
     for at in 0..4 {
         let n = delaunay.neighbors[cell as usize][at];
         let radius = facets.radius(cell, at).min(1e30);
-        growth += if solid.inside[n as usize] == inside { radius } else { -radius };
+        growth += if solid.inside[n as usize] == inside {
+            radius
+        } else {
+            -radius
+        };
         sum += radius;
     }
     let votes = f32::from(solid.votes[cell as usize]);
     4.0 * growth / sum + if inside { 0.5 * votes } else { -0.5 * votes }
 }
-

@@ -51,17 +51,29 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
         Rings::Auto => {
             let spacing = spacing(cloud, neighbors);
             let noise = noise_mm(cloud, neighbors, &spacing);
-            if noise > TWO_RINGS_FROM * spacing.mean_mm { Rings::Two } else { Rings::One }
+            if noise > TWO_RINGS_FROM * spacing.mean_mm {
+                Rings::Two
+            } else {
+                Rings::One
+            }
         }
         chosen => chosen,
     };
     let count = body.delaunay.points.len() as u32;
-    let one: Vec<DVec3> = (0..count).into_par_iter().map(|v| ring_sum(body, v).normalize_or_zero()).collect();
+    let one: Vec<DVec3> = (0..count)
+        .into_par_iter()
+        .map(|v| ring_sum(body, v).normalize_or_zero())
+        .collect();
     let of_vertex: Vec<Vec3> = match rings {
-        Rings::Two => (0..count).into_par_iter().map(|v| two_rings(body, v, &one).as_vec3()).collect(),
+        Rings::Two => (0..count)
+            .into_par_iter()
+            .map(|v| two_rings(body, v, &one).as_vec3())
+            .collect(),
         _ => one.iter().map(|n| n.as_vec3()).collect(),
     };
-    let mut normals: Vec<Vec3> = (body.delaunay.vertex_of.iter()).map(|v| of_vertex[*v as usize]).collect();
+    let mut normals: Vec<Vec3> = (body.delaunay.vertex_of.iter())
+        .map(|v| of_vertex[*v as usize])
+        .collect();
     let mut by_plane = 0;
     if normals.contains(&Vec3::ZERO) {
         let planes = weighted_plane_normals(&cloud.positions, neighbors, PLANE_NEIGHBOURS);
@@ -100,7 +112,12 @@ fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, f64, [u32; 2], 
             let others = [corners[(at_v + 1) % 3], corners[(at_v + 2) % 3]];
             let p = delaunay.points[v as usize];
             let [u, w] = others.map(|u| delaunay.points[u as usize] - p);
-            with(normal, u.angle_between(w), others, facet(delaunay, cell, at));
+            with(
+                normal,
+                u.angle_between(w),
+                others,
+                facet(delaunay, cell, at),
+            );
         }
     }
 }
@@ -148,7 +165,11 @@ pub fn orient_normals(positions: &[DVec3], neighbors: &Neighbors, normals: &mut 
                 // The bits of a positive number sort as the number does.
                 (turn.to_bits(), i.min(*j), i.max(*j))
             };
-            found.iter().map(edge).filter(|e| e.1 != e.2).collect::<Vec<_>>()
+            found
+                .iter()
+                .map(edge)
+                .filter(|e| e.1 != e.2)
+                .collect::<Vec<_>>()
         })
         .flatten_iter()
         .collect();
@@ -173,7 +194,11 @@ pub fn orient_normals(positions: &[DVec3], neighbors: &Neighbors, normals: &mut 
             normals[i as usize] = -normals[i as usize];
         }
     }
-    let tops: Vec<u32> = highest.iter().map(|t| t.0).filter(|t| *t != u32::MAX).collect();
+    let tops: Vec<u32> = highest
+        .iter()
+        .map(|t| t.0)
+        .filter(|t| *t != u32::MAX)
+        .collect();
     for top in tops {
         let n = &mut normals[top as usize];
         if n.z < 0.0 {

@@ -26,11 +26,12 @@ pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
         surface(delaunay, &body.solid.inside)
     };
     let typical = typical_edges(delaunay, &triangles);
+    let most = longest_seen(&typical);
     triangles.retain(|t| {
         (0..3).all(|k| {
             let (a, b) = (t[k], t[(k + 1) % 3]);
             let length = delaunay.points[a as usize].distance(delaunay.points[b as usize]);
-            length <= BRIDGE * typical[a as usize].min(typical[b as usize])
+            length <= (BRIDGE * typical[a as usize].min(typical[b as usize])).min(most)
         })
     });
     one_fan_each(delaunay.points.len(), triangles)
@@ -113,6 +114,16 @@ fn typical_edges(delaunay: &Delaunay, triangles: &[[u32; 3]]) -> Vec<f64> {
     lengths.iter_mut().map(typical).collect()
 }
 
+/// Length above which an edge bridges whatever its surroundings: along a border even typical edges may be bridges.
+fn longest_seen(typical: &[f64]) -> f64 {
+    let mut all: Vec<f64> = typical.iter().copied().filter(|l| *l > 0.0).collect();
+    if all.is_empty() {
+        return f64::INFINITY;
+    }
+    let at = (all.len() - 1) * 9 / 10;
+    BRIDGE * *all.select_nth_unstable_by(at, f64::total_cmp).1
+}
+
 /// Leaves every vertex one fan or ring of triangles, the largest.
 fn one_fan_each(vertices: usize, mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
     loop {
@@ -127,7 +138,10 @@ fn one_fan_each(vertices: usize, mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> 
             let fans = fans(v, own, &triangles);
             let mut sizes: HashMap<u32, usize> = HashMap::new();
             fans.iter().for_each(|f| *sizes.entry(*f).or_default() += 1);
-            let Some((&largest, _)) = sizes.iter().max_by_key(|(f, n)| (**n, std::cmp::Reverse(**f))) else {
+            let Some((&largest, _)) = sizes
+                .iter()
+                .max_by_key(|(f, n)| (**n, std::cmp::Reverse(**f)))
+            else {
                 continue;
             };
             for (i, fan) in own.iter().zip(&fans) {
@@ -156,7 +170,9 @@ fn fans(v: u32, own: &[u32], triangles: &[[u32; 3]]) -> Vec<u32> {
         for j in 0..i {
             if fan[i] != fan[j] && shares(own[i], own[j]) {
                 let (low, high) = (fan[i].min(fan[j]), fan[i].max(fan[j]));
-                fan.iter_mut().filter(|f| **f == high).for_each(|f| *f = low);
+                fan.iter_mut()
+                    .filter(|f| **f == high)
+                    .for_each(|f| *f = low);
             }
         }
     }

@@ -5,9 +5,17 @@ use glam::{DMat3, DVec3};
 /// The bytes of a PNG picture of `triangles` over `positions`, looked at along `sight`, with z upwards where that is possible.
 ///
 /// Triangles seen from behind are red: a sound closed mesh shows none.
-pub fn render(positions: &[DVec3], triangles: &[[u32; 3]], sight: DVec3, (width, height): (u32, u32)) -> Vec<u8> {
+pub fn render(
+    positions: &[DVec3],
+    triangles: &[[u32; 3]],
+    sight: DVec3,
+    (width, height): (u32, u32),
+) -> Vec<u8> {
     const LARGEST_SIDE_PX: u32 = 8192;
-    let (width, height) = (width.clamp(1, LARGEST_SIDE_PX), height.clamp(1, LARGEST_SIDE_PX));
+    let (width, height) = (
+        width.clamp(1, LARGEST_SIDE_PX),
+        height.clamp(1, LARGEST_SIDE_PX),
+    );
     let axes = screen_axes(sight);
     let points: Vec<DVec3> = positions.iter().map(|p| axes * *p).collect();
     let mut canvas = Canvas {
@@ -23,7 +31,11 @@ pub fn render(positions: &[DVec3], triangles: &[[u32; 3]], sight: DVec3, (width,
     let middle = (low + high) / 2.0;
     let to_pixel = |p: DVec3| {
         let q = (p - middle) * scale;
-        DVec3::new(0.5 * f64::from(width) + q.x, 0.5 * f64::from(height) - q.y, q.z)
+        DVec3::new(
+            0.5 * f64::from(width) + q.x,
+            0.5 * f64::from(height) - q.y,
+            q.z,
+        )
     };
     for t in triangles {
         let [a, b, c] = t.map(|v| points[v as usize]);
@@ -36,7 +48,11 @@ pub fn render(positions: &[DVec3], triangles: &[[u32; 3]], sight: DVec3, (width,
 /// Rows: right, up, and towards the eye.
 fn screen_axes(sight: DVec3) -> DMat3 {
     let eye = (-sight).try_normalize().unwrap_or(DVec3::Z);
-    let up = if eye.z.abs() > 0.99 { DVec3::Y } else { DVec3::Z };
+    let up = if eye.z.abs() > 0.99 {
+        DVec3::Y
+    } else {
+        DVec3::Z
+    };
     let right = up.cross(eye).normalize();
     DMat3::from_cols(right, eye.cross(right), eye).transpose()
 }
@@ -69,9 +85,11 @@ impl Canvas {
         let low = a.min(b).min(c);
         let high = a.max(b).max(c);
         // A cast keeps within the range of its type.
-        let rows = low.y.floor().max(0.0) as usize..(high.y.ceil().max(0.0) as usize).min(self.height);
+        let rows =
+            low.y.floor().max(0.0) as usize..(high.y.ceil().max(0.0) as usize).min(self.height);
         for row in rows {
-            let columns = low.x.floor().max(0.0) as usize..(high.x.ceil().max(0.0) as usize).min(self.width);
+            let columns =
+                low.x.floor().max(0.0) as usize..(high.x.ceil().max(0.0) as usize).min(self.width);
             for column in columns {
                 let p = DVec3::new(column as f64 + 0.5, row as f64 + 0.5, 0.0).truncate();
                 let wb = (p - a.truncate()).perp_dot((c - a).truncate()) / area;

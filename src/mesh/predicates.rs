@@ -61,7 +61,8 @@ impl Signs {
         let most = ad.abs().max(bd.abs()).max(cd.abs());
         let product = most.x * most.y * most.z;
         // No product: all four in one plane across an axis, for differences never underflow to zero.
-        if det.abs() > ORIENT_ERROR * product || product == 0.0 || most.max_element() <= self.exact {
+        if det.abs() > ORIENT_ERROR * product || product == 0.0 || most.max_element() <= self.exact
+        {
             return det;
         }
         robust::orient3d(coord(a), coord(b), coord(c), coord(d))
@@ -168,7 +169,10 @@ mod tests {
         assert!(SIGNS.in_sphere(CELL, DVec3::splat(0.3)) > 0.0);
         assert!(SIGNS.in_sphere(CELL, DVec3::splat(1.1)) < 0.0);
         assert_eq!(SIGNS.in_sphere(CELL, DVec3::ONE), 0.0);
-        assert_eq!(SIGNS.orient(CELL[0], CELL[1], CELL[2], DVec3::new(7.0, 3.0, 0.0)), 0.0);
+        assert_eq!(
+            SIGNS.orient(CELL[0], CELL[1], CELL[2], DVec3::new(7.0, 3.0, 0.0)),
+            0.0
+        );
     }
 
     #[test]
@@ -178,12 +182,19 @@ mod tests {
         for i in -40..40i32 {
             for j in -3..3i32 {
                 let p = DVec3::new(0.4, 0.6, f64::from(i) * tiny * 0.01 + f64::from(j) * 1e-18);
-                let exact = robust::orient3d(coord(CELL[0]), coord(CELL[1]), coord(CELL[2]), coord(p));
-                assert_eq!(SIGNS.orient(CELL[0], CELL[1], CELL[2], p).partial_cmp(&0.0), exact.partial_cmp(&0.0));
+                let exact =
+                    robust::orient3d(coord(CELL[0]), coord(CELL[1]), coord(CELL[2]), coord(p));
+                assert_eq!(
+                    SIGNS.orient(CELL[0], CELL[1], CELL[2], p).partial_cmp(&0.0),
+                    exact.partial_cmp(&0.0)
+                );
                 let q = DVec3::ONE + DVec3::new(0.0, f64::from(j), f64::from(i)) * tiny;
                 let [a, b, c, d] = CELL.map(coord);
                 let exact = robust::insphere(a, b, c, d, coord(q));
-                assert_eq!(SIGNS.in_sphere(CELL, q).partial_cmp(&0.0), exact.partial_cmp(&0.0));
+                assert_eq!(
+                    SIGNS.in_sphere(CELL, q).partial_cmp(&0.0),
+                    exact.partial_cmp(&0.0)
+                );
             }
         }
     }
@@ -207,22 +218,39 @@ mod tests {
         }
         assert!(asked > 1000);
         assert!(collinear(DVec3::ZERO, DVec3::ONE, DVec3::splat(0.3)));
-        assert!(!collinear(DVec3::ZERO, DVec3::ONE, DVec3::new(0.3, 0.3, 0.3 + 1e-16)));
+        assert!(!collinear(
+            DVec3::ZERO,
+            DVec3::ONE,
+            DVec3::new(0.3, 0.3, 0.3 + 1e-16)
+        ));
     }
 
     #[test]
     fn the_grid_of_the_points_is_found_and_changes_no_sign() {
-        let steps: Vec<DVec3> = (0..64u8).map(|i| DVec3::new(f64::from(i & 3), f64::from(i >> 2 & 3), f64::from(i >> 4)) * 0.375).collect();
+        let steps: Vec<DVec3> = (0..64u8)
+            .map(|i| DVec3::new(f64::from(i & 3), f64::from(i >> 2 & 3), f64::from(i >> 4)) * 0.375)
+            .collect();
         let on_grid = Signs::of(&steps);
         assert_eq!(on_grid.exact, 512.0 * 0.375 / 3.0);
         assert!(Signs::of(&[DVec3::splat(0.1)]).exact < 1e-13);
         for i in 0..60 {
             for j in 0..64 {
-                let cell = [steps[i], steps[(7 * i + 1) % 64], steps[(11 * i + 5) % 64], steps[(i * i + 3) % 64]];
+                let cell = [
+                    steps[i],
+                    steps[(7 * i + 1) % 64],
+                    steps[(11 * i + 5) % 64],
+                    steps[(i * i + 3) % 64],
+                ];
                 let p = steps[j];
                 let sign = |x: f64| x.partial_cmp(&0.0);
-                assert_eq!(sign(on_grid.in_sphere(cell, p)), sign(SIGNS.in_sphere(cell, p)));
-                assert_eq!(sign(on_grid.orient(cell[0], cell[1], cell[2], p)), sign(SIGNS.orient(cell[0], cell[1], cell[2], p)));
+                assert_eq!(
+                    sign(on_grid.in_sphere(cell, p)),
+                    sign(SIGNS.in_sphere(cell, p))
+                );
+                assert_eq!(
+                    sign(on_grid.orient(cell[0], cell[1], cell[2], p)),
+                    sign(SIGNS.orient(cell[0], cell[1], cell[2], p))
+                );
             }
         }
     }

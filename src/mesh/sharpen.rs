@@ -26,16 +26,24 @@ pub fn sharpen(delaunay: &Delaunay, stars: &Stars, inside: &mut [bool]) -> usize
     for _ in 0..MOST_ROUNDS {
         let mut next = Vec::new();
         for &cell in &cells {
-            let Some(quad) = Quad::of(delaunay, inside, cell) else { continue };
+            let Some(quad) = Quad::of(delaunay, inside, cell) else {
+                continue;
+            };
             if quad.gain(delaunay, inside) <= LEAST_GAIN {
                 continue;
             }
             let corners = delaunay.cells[cell as usize];
-            if corners.iter().any(|v| defect(delaunay, stars, inside, *v, &mut ring) > 0) {
+            if corners
+                .iter()
+                .any(|v| defect(delaunay, stars, inside, *v, &mut ring) > 0)
+            {
                 continue;
             }
             inside[cell as usize] ^= true;
-            if corners.iter().any(|v| defect(delaunay, stars, inside, *v, &mut ring) > 0) {
+            if corners
+                .iter()
+                .any(|v| defect(delaunay, stars, inside, *v, &mut ring) > 0)
+            {
                 inside[cell as usize] ^= true;
                 continue;
             }
@@ -98,12 +106,24 @@ impl Quad {
             for (j, other) in [(0, p), (1, q)] {
                 // The surface's facet at this edge is opposite to the other end of `new`.
                 let facet = self.new[1 - j];
-                let beyond = across_edge(delaunay, inside, self.cell, facet, own, other, corners[self.old[1 - i]]);
+                let beyond = across_edge(
+                    delaunay,
+                    inside,
+                    self.cell,
+                    facet,
+                    own,
+                    other,
+                    corners[self.old[1 - i]],
+                );
                 before += bend(at(own), at(other), at(corners[self.old[1 - i]]), at(beyond));
                 after += bend(at(own), at(other), at(corners[self.new[1 - j]]), at(beyond));
             }
         }
-        if before > 0.0 { (before - after) / before } else { 0.0 }
+        if before > 0.0 {
+            (before - after) / before
+        } else {
+            0.0
+        }
     }
 }
 
@@ -118,7 +138,15 @@ fn bend(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> f64 {
 }
 
 /// The third corner of the other surface triangle at edge `a` `b` of the surface facet opposite corner `at` of `cell`, whose third corner is `third`.
-fn across_edge(delaunay: &Delaunay, inside: &[bool], cell: u32, at: usize, a: u32, b: u32, third: u32) -> u32 {
+fn across_edge(
+    delaunay: &Delaunay,
+    inside: &[bool],
+    cell: u32,
+    at: usize,
+    a: u32,
+    b: u32,
+    third: u32,
+) -> u32 {
     debug_assert!(a != b && third != a && third != b);
     let mut n = delaunay.neighbors[cell as usize][at];
     let beyond = inside[n as usize];

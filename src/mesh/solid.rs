@@ -96,7 +96,11 @@ pub fn vote(delaunay: &Delaunay, stars: &Stars, facets: &Facets) -> Solid {
             (0..4)
                 .map(|k| {
                     let weight = weight[corners[k] as usize];
-                    if sides[cell] >> k & 1 == 1 { weight } else { -weight }
+                    if sides[cell] >> k & 1 == 1 {
+                        weight
+                    } else {
+                        -weight
+                    }
                 })
                 .sum()
         })
@@ -188,7 +192,9 @@ fn join_rest(delaunay: &Delaunay, (sides, two_sided): (&[u8], &[bool]), senses: 
             for (own, other) in [(a, b), (b, a)] {
                 let found = best.entry(own).or_insert((0, u32::MAX));
                 // Among equals the lowest: a hash map has no order of its own.
-                if (count.abs(), std::cmp::Reverse(other)) > (found.0.abs(), std::cmp::Reverse(found.1)) {
+                if (count.abs(), std::cmp::Reverse(other))
+                    > (found.0.abs(), std::cmp::Reverse(found.1))
+                {
                     *found = (count, other);
                 }
             }
@@ -207,7 +213,12 @@ fn join_rest(delaunay: &Delaunay, (sides, two_sided): (&[u8], &[bool]), senses: 
         let mut next = HashMap::new();
         for ((a, b), count) in shared {
             let ((a, a_turned), (b, b_turned)) = (senses.of(a), senses.of(b));
-            add(&mut next, a, b, if a_turned == b_turned { count } else { -count });
+            add(
+                &mut next,
+                a,
+                b,
+                if a_turned == b_turned { count } else { -count },
+            );
         }
         shared = next;
     }
@@ -237,7 +248,13 @@ fn inward(
         .map(|v| {
             let (set, turned) = senses.of(v);
             let sense = seen[set as usize].signum() as i8;
-            if !two_sided[v as usize] { 0 } else if turned { -sense } else { sense }
+            if !two_sided[v as usize] {
+                0
+            } else if turned {
+                -sense
+            } else {
+                sense
+            }
         })
         .collect()
 }

@@ -27,7 +27,13 @@ impl Stars {
             starts[v + 2] += starts[v + 1];
         }
         let mut corners = vec![0; starts[count + 1] as usize];
-        for (code, v) in delaunay.cells.iter().flatten().enumerate().filter(|(_, v)| **v != GHOST) {
+        for (code, v) in delaunay
+            .cells
+            .iter()
+            .flatten()
+            .enumerate()
+            .filter(|(_, v)| **v != GHOST)
+        {
             let at = &mut starts[*v as usize + 1];
             corners[*at as usize] = code as u32;
             *at += 1;
@@ -162,7 +168,8 @@ fn measure(delaunay: &Delaunay, cell: u32) -> ([f32; 4], [AtomicU8; 4]) {
                 v != GHOST
                     && delaunay.points[v as usize].distance_squared(centre) < squared * (1.0 - 1e-9)
             };
-            let is_empty = !holds(delaunay.cells[cell as usize][at]) && !holds(delaunay.across(cell, at));
+            let is_empty =
+                !holds(delaunay.cells[cell as usize][at]) && !holds(delaunay.across(cell, at));
             marks[at] = if is_empty { GABRIEL } else { 0 };
         }
     }
@@ -173,7 +180,8 @@ fn measure(delaunay: &Delaunay, cell: u32) -> ([f32; 4], [AtomicU8; 4]) {
 pub fn circle(a: DVec3, b: DVec3, c: DVec3) -> (DVec3, f64) {
     let (u, v) = (b - a, c - a);
     let n = u.cross(v);
-    let way = (n.cross(u) * v.length_squared() + v.cross(n) * u.length_squared()) / (2.0 * n.length_squared());
+    let way = (n.cross(u) * v.length_squared() + v.cross(n) * u.length_squared())
+        / (2.0 * n.length_squared());
     if way.is_finite() {
         (a + way, way.length_squared())
     } else {
@@ -187,10 +195,17 @@ mod tests {
 
     #[test]
     fn the_circle_goes_through_its_points() {
-        let [a, b, c] = [DVec3::new(1.0, 2.0, 3.0), DVec3::new(4.0, -1.0, 0.5), DVec3::new(-2.0, 0.0, 1.0)];
+        let [a, b, c] = [
+            DVec3::new(1.0, 2.0, 3.0),
+            DVec3::new(4.0, -1.0, 0.5),
+            DVec3::new(-2.0, 0.0, 1.0),
+        ];
         let (centre, squared) = circle(a, b, c);
         for p in [a, b, c] {
-            assert!((p.distance_squared(centre) - squared).abs() < 1e-12 * squared, "rounding");
+            assert!(
+                (p.distance_squared(centre) - squared).abs() < 1e-12 * squared,
+                "rounding"
+            );
         }
         assert!((b - a).cross(c - a).dot(centre - a).abs() < 1e-12);
         assert_eq!(circle(a, a, b).1, f64::INFINITY);

@@ -8,8 +8,8 @@ use std::f64::consts::{PI, TAU};
 use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
-use super::delaunay::{Delaunay, FACETS, GHOST};
 use super::cone::Cones;
+use super::delaunay::{Delaunay, FACETS, GHOST};
 use super::star::{Facets, Stars, corner, facet, vertices};
 
 /// Rounds of matching after which what is not matched stays so; the author's slowest took 11.
@@ -78,7 +78,12 @@ pub enum Queue {
 ///
 /// All vertices choose at once from what all had chosen before, so the result does not depend on the number of threads. Ends when all are matched,
 /// nothing changes, or after 40 rounds: where data are noisy or too sparse some vertices change their minds for ever.
-pub fn match_umbrellas(delaunay: &Delaunay, stars: &Stars, facets: &Facets, with_cone: bool) -> Matching {
+pub fn match_umbrellas(
+    delaunay: &Delaunay,
+    stars: &Stars,
+    facets: &Facets,
+    with_cone: bool,
+) -> Matching {
     let mut active: Vec<u32> = (0..delaunay.points.len() as u32).collect();
     let total = active.len();
     let axes = axes(delaunay, stars);
@@ -167,19 +172,30 @@ pub fn umbrella(
     for (f, ..) in facets_at(delaunay, stars, v) {
         if facets.is_in_umbrella_of(delaunay, f, v) {
             let [a, b, c] = vertices(delaunay, f);
-            let (from, to) = if a == v { (b, c) } else if b == v { (c, a) } else { (a, b) };
+            let (from, to) = if a == v {
+                (b, c)
+            } else if b == v {
+                (c, a)
+            } else {
+                (a, b)
+            };
             ring.push(Panel { facet: f, from, to });
         }
     }
     for i in 1..ring.len() {
         let end = ring[i - 1].to;
-        let Some(next) = (i..ring.len()).find(|j| ring[*j].from == end || ring[*j].to == end) else {
+        let Some(next) = (i..ring.len()).find(|j| ring[*j].from == end || ring[*j].to == end)
+        else {
             break;
         };
         ring.swap(i, next);
         if ring[i].from != end {
             let Panel { facet, from, to } = ring[i];
-            ring[i] = Panel { facet, from: to, to: from };
+            ring[i] = Panel {
+                facet,
+                from: to,
+                to: from,
+            };
         }
     }
     let p = delaunay.points[v as usize];
@@ -189,14 +205,23 @@ pub fn umbrella(
         ring.reverse();
         for panel in ring.iter_mut() {
             let Panel { facet, from, to } = *panel;
-            *panel = Panel { facet, from: to, to: from };
+            *panel = Panel {
+                facet,
+                from: to,
+                to: from,
+            };
         }
     }
 }
 
 /// Lets all `active` vertices choose.
 fn choose(work: &Work, active: &[u32], queue: Queue) {
-    let Work { delaunay, stars, facets, .. } = *work;
+    let Work {
+        delaunay,
+        stars,
+        facets,
+        ..
+    } = *work;
     let chosen: Vec<(Vec<u32>, Vec<u32>)> = active
         .par_chunks(GRAIN)
         .map_init(Bench::default, |bench, some| {
@@ -209,20 +234,23 @@ fn choose(work: &Work, active: &[u32], queue: Queue) {
             (ends, all)
         })
         .collect();
-    active.par_chunks(GRAIN).zip(&chosen).for_each(|(some, (ends, all))| {
-        let mut start = 0;
-        for (&v, &end) in some.iter().zip(ends) {
-            if queue != Queue::Initial {
-                for (f, ..) in facets_at(delaunay, stars, v) {
-                    facets.set(delaunay, f, v, false);
+    active
+        .par_chunks(GRAIN)
+        .zip(&chosen)
+        .for_each(|(some, (ends, all))| {
+            let mut start = 0;
+            for (&v, &end) in some.iter().zip(ends) {
+                if queue != Queue::Initial {
+                    for (f, ..) in facets_at(delaunay, stars, v) {
+                        facets.set(delaunay, f, v, false);
+                    }
                 }
+                for &f in &all[start..end as usize] {
+                    facets.set(delaunay, f, v, true);
+                }
+                start = end as usize;
             }
-            for &f in &all[start..end as usize] {
-                facets.set(delaunay, f, v, true);
-            }
-            start = end as usize;
-        }
-    });
+        });
 }
 
 impl Bench {
@@ -234,9 +262,22 @@ impl Bench {
     }
 
     fn collect(&mut self, work: &Work, v: u32, queue: Queue) {
-        let Work { delaunay, stars, facets, axes, .. } = *work;
+        let Work {
+            delaunay,
+            stars,
+            facets,
+            axes,
+            ..
+        } = *work;
         let cone = match (queue, work.cones) {
-            (Queue::Cone, Some(cones)) => cones.of(delaunay, stars, facets, v, axes[v as usize].as_dvec3(), work.is_open),
+            (Queue::Cone, Some(cones)) => cones.of(
+                delaunay,
+                stars,
+                facets,
+                v,
+                axes[v as usize].as_dvec3(),
+                work.is_open,
+            ),
             _ => None,
         };
         self.spokes.clear();
@@ -254,14 +295,17 @@ impl Bench {
                     let own = facets.is_in_umbrella_of(delaunay, facet, v);
                     let holds = || {
                         let radius = facets.radius(cell, at);
-                        cone.as_ref().is_some_and(|c| c.holds(delaunay, facet, radius))
+                        cone.as_ref()
+                            .is_some_and(|c| c.holds(delaunay, facet, radius))
                     };
                     let first = matches == 3 || holds();
                     8 * u8::from(first) + 2 * matches + u8::from(own)
                 }
             };
             let corners = delaunay.cells[cell as usize];
-            let mut ends = (0..4).filter(|k| *k != at && corners[*k] != v).map(|k| corners[k]);
+            let mut ends = (0..4)
+                .filter(|k| *k != at && corners[*k] != v)
+                .map(|k| corners[k]);
             // A facet at `v` has two other corners.
             let ends = [ends.next().unwrap_or(v), ends.next().unwrap_or(v)];
             self.around.extend(ends);
@@ -276,7 +320,9 @@ impl Bench {
         self.around.dedup();
         for spoke in &mut self.spokes {
             // Every end was put in.
-            spoke.ends = spoke.ends.map(|e| self.around.partition_point(|a| *a < e) as u32);
+            spoke.ends = spoke
+                .ends
+                .map(|e| self.around.partition_point(|a| *a < e) as u32);
         }
         let axis = axes[v as usize].as_dvec3();
         let x = axis.any_orthonormal_vector();
@@ -296,7 +342,8 @@ impl Bench {
         self.best.clear();
         self.taken.clear();
         self.trees.clear();
-        self.trees.extend((0..self.around.len() as u32).map(|i| (i, 0.0)));
+        self.trees
+            .extend((0..self.around.len() as u32).map(|i| (i, 0.0)));
         for s in 0..self.spokes.len() {
             let [a, b] = self.spokes[s].ends;
             // A facet spans less than half a turn.
@@ -353,7 +400,11 @@ impl Bench {
         while at != a {
             let spoke = self.spokes[by[at as usize] as usize];
             self.best.push(spoke.facet);
-            at = if spoke.ends[0] == at { spoke.ends[1] } else { spoke.ends[0] };
+            at = if spoke.ends[0] == at {
+                spoke.ends[1]
+            } else {
+                spoke.ends[0]
+            };
         }
     }
 }
@@ -387,14 +438,20 @@ fn axes(delaunay: &Delaunay, stars: &Stars) -> Vec<Vec3> {
         let direction = beyond.try_normalize().or(pole.try_normalize());
         direction.unwrap_or(DVec3::Z).as_vec3().normalize()
     };
-    (0..delaunay.points.len() as u32).into_par_iter().map(axis).collect()
+    (0..delaunay.points.len() as u32)
+        .into_par_iter()
+        .map(axis)
+        .collect()
 }
 
 /// The point as far from all four corners; not finite where they are nearly in one plane.
 fn circumcentre([a, b, c, d]: [DVec3; 4]) -> DVec3 {
     let (u, v, w) = (b - a, c - a, d - a);
     let volume = 2.0 * u.dot(v.cross(w));
-    a + (v.cross(w) * u.length_squared() + w.cross(u) * v.length_squared() + u.cross(v) * w.length_squared()) / volume
+    a + (v.cross(w) * u.length_squared()
+        + w.cross(u) * v.length_squared()
+        + u.cross(v) * w.length_squared())
+        / volume
 }
 
 /// The two sides of the umbrella of every vertex, as bits at the corners of cells: which corners have the cell on their second side.
@@ -402,7 +459,9 @@ fn circumcentre([a, b, c, d]: [DVec3; 4]) -> DVec3 {
 /// The second return value tells which vertices have an umbrella with two sides.
 pub fn sides(delaunay: &Delaunay, stars: &Stars, facets: &Facets) -> (Vec<u8>, Vec<bool>) {
     use std::sync::atomic::{AtomicU8, Ordering::Relaxed};
-    let bits: Vec<AtomicU8> = (0..delaunay.cells.len()).map(|_| AtomicU8::new(0)).collect();
+    let bits: Vec<AtomicU8> = (0..delaunay.cells.len())
+        .map(|_| AtomicU8::new(0))
+        .collect();
     let two_sided = (0..delaunay.points.len() as u32)
         .into_par_iter()
         .map_init(Vec::new, |stack, v| {
@@ -438,6 +497,8 @@ pub fn sides(delaunay: &Delaunay, stars: &Stars, facets: &Facets) -> (Vec<u8>, V
             parts == 2
         })
         .collect();
-    (bits.into_iter().map(AtomicU8::into_inner).collect(), two_sided)
+    (
+        bits.into_iter().map(AtomicU8::into_inner).collect(),
+        two_sided,
+    )
 }
-

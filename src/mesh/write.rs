@@ -39,7 +39,8 @@ fn ply(positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<u8> {
     }
     for t in triangles {
         out.push(3);
-        t.iter().for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
+        t.iter()
+            .for_each(|v| out.extend_from_slice(&v.to_le_bytes()));
     }
     out
 }
@@ -53,7 +54,9 @@ fn stl(positions: &[DVec3], triangles: &[[u32; 3]]) -> Vec<u8> {
         let [a, b, c] = t.map(|v| positions[v as usize]);
         let normal = (b - a).cross(c - a).normalize_or_zero();
         for p in [normal, a, b, c] {
-            p.to_array().iter().for_each(|x| out.extend_from_slice(&(*x as f32).to_le_bytes()));
+            p.to_array()
+                .iter()
+                .for_each(|x| out.extend_from_slice(&(*x as f32).to_le_bytes()));
         }
         out.extend_from_slice(&[0, 0]);
     }
@@ -78,13 +81,21 @@ mod tests {
 
     #[test]
     fn the_files_have_the_sizes_their_formats_say() {
-        let positions = [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::new(0.1, 0.2, 1e-300)];
+        let positions = [
+            DVec3::ZERO,
+            DVec3::X,
+            DVec3::Y,
+            DVec3::new(0.1, 0.2, 1e-300),
+        ];
         let triangles = [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]];
         let stl = mesh_bytes(&positions, &triangles, MeshForm::Stl);
         assert_eq!(stl.len(), 84 + 4 * 50);
         assert!(!stl.starts_with(b"solid"));
         let ply = mesh_bytes(&positions, &triangles, MeshForm::Ply);
-        let header = ply.windows(11).position(|w| w == b"end_header\n").map(|at| at + 11);
+        let header = ply
+            .windows(11)
+            .position(|w| w == b"end_header\n")
+            .map(|at| at + 11);
         assert_eq!(header.map(|h| ply.len() - h), Some(4 * 24 + 4 * 13));
         let obj = String::from_utf8(mesh_bytes(&positions, &triangles, MeshForm::Obj)).unwrap();
         assert_eq!(obj.lines().nth(4), Some("v 0.1 0.2 1e-300"));
