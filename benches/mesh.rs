@@ -4,6 +4,7 @@
 //! points) by default. Speeds are also given as ratios to a reference of the same run: twenty neighbours of every point on a k-d tree, one
 //! thread. `PICTURES=FOLDER` writes shaded pictures of the meshes.
 
+use std::collections::HashSet;
 use std::time::Instant;
 
 use acies::mesh::{Body, Delaunay, Mesh, Rings, Settings, check_delaunay, mesh, normals, picture};
@@ -217,24 +218,54 @@ fn table52() {
     );
 }
 
-/// Links along true edges and triangles off the surface, for clouds with points made on edges in order.
+/// Links along true edges, for clouds whose points on edges come first and in order.
+///
+/// Where a point of a face lies too near an edge the link there is no edge of the Delaunay triangulation, and no mesh made of it can have it.
 fn links(made: &Mesh, sampled: &clouds::Sampled) {
-    let edges: std::collections::HashSet<(u32, u32)> = (made.triangles.iter())
-        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
-        .map(|(a, b)| (a.min(b), a.max(b)))
+    let ordered = |a: u32, b: u32| (a.min(b), a.max(b));
+    let edges: HashSet<(u32, u32)> = (made.triangles.iter())
+        .flat_map(|t| {
+            [
+                ordered(t[0], t[1]),
+                ordered(t[1], t[2]),
+                ordered(t[2], t[0]),
+            ]
+        })
+        .collect();
+    let delaunay = Delaunay::new(&sampled.points).expect("a body");
+    let source = |v: u32| {
+        delaunay
+            .sources
+            .get(v as usize)
+            .copied()
+            .unwrap_or(u32::MAX)
+    };
+    let possible: HashSet<(u32, u32)> = (delaunay.cells.iter())
+        .map(|c| c.map(source))
+        .flat_map(|c| {
+            [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].map(|(i, j)| ordered(c[i], c[j]))
+        })
         .collect();
     let on_edge = sampled.on_edge.iter().filter(|o| **o).count() as u32;
-    // Points on edges come first, evenly along one edge after the other.
-    let (mut found, mut all) = (0, 0);
-    for i in 1..on_edge {
-        let [a, b] = [i - 1, i].map(|i| sampled.points[i as usize]);
-        let same = |l: &&Line| l.distance(a) < 1e-9 && l.distance(b) < 1e-9;
-        if sampled.edges.iter().find(same).is_some() {
-            all += 1;
-            found += usize::from(edges.contains(&(i - 1, i)));
-        }
-    }
-    println!("    {found} of {all} links along the true edges");
+    let along = |i: &u32| {
+        let [a, b] = [*i - 1, *i].map(|i| sampled.points[i as usize]);
+        // Made there; rounding only.
+        let is_on = |l: &Line| l.distance(a) < 1e-9 && l.distance(b) < 1e-9;
+        sampled.edges.iter().any(is_on)
+    };
+    let all: Vec<u32> = (1..on_edge).filter(along).collect();
+    let found = all
+        .iter()
+        .filter(|i| edges.contains(&(**i - 1, **i)))
+        .count();
+    let most = all
+        .iter()
+        .filter(|i| possible.contains(&(**i - 1, **i)))
+        .count();
+    println!(
+        "    {found} of {} links along the true edges; {most} are in the triangulation",
+        all.len()
+    );
 }
 
 fn peers() {
@@ -413,7 +444,7 @@ fn sharp() {
     for (name, points, edges) in rows {
         for cone in [false, true] {
             let made = mesh(&points, Settings { cone, open: false }).expect("a body");
-            let has: std::collections::HashSet<(u32, u32)> = (made.triangles.iter())
+            let has: HashSet<(u32, u32)> = (made.triangles.iter())
                 .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
                 .map(|(a, b)| (made.sources[a as usize], made.sources[b as usize]))
                 .map(|(a, b)| (a.min(b), a.max(b)))

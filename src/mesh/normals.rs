@@ -7,6 +7,7 @@ use super::Body;
 use super::delaunay::{FACETS, GHOST};
 use super::solid::Senses;
 use super::star::{corner, facet};
+use crate::geometry::fit::NormalSums;
 use crate::points::{Neighbors, PointCloud, noise_mm, spacing};
 use crate::surface::weighted_plane_normals;
 
@@ -44,7 +45,8 @@ const PLANE_NEIGHBOURS: usize = 40;
 ///
 /// We differ: the thesis takes the facets of an umbrella whether its neighbours have them or not, weighted by matching index times angle (Ma
 /// 2011, equation 4.6), and a plane where fewer than three match. Here every vertex has the closed ring of the mesh; facets that
-/// matching alone found weigh their index, the others one. The plane remains for points without triangles. Orientation needs no
+/// matching alone found weigh their index, the others one. Where the surface turns smoothly and points are clean, that
+/// normal is corrected by a cubic through two rings. The plane remains for points without triangles. Orientation needs no
 /// propagation: the body has an outside. Whether one ring or two follows from the noise of the points, not from the user.
 pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Rings) -> Normals {
     let rings = match rings {
@@ -69,7 +71,10 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
             .into_par_iter()
             .map(|v| two_rings(body, v, &one).as_vec3())
             .collect(),
-        _ => one.iter().map(|n| n.as_vec3()).collect(),
+        _ => (0..count)
+            .into_par_iter()
+            .map(|v| cubic(body, v, &one).unwrap_or(one[v as usize]).as_vec3())
+            .collect(),
     };
     let mut normals: Vec<Vec3> = (body.delaunay.vertex_of.iter())
         .map(|v| of_vertex[*v as usize])
@@ -92,7 +97,8 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
     }
 }
 
-/// Calls `with` for every triangle of the surface at `v`: its outward normal (twice the area long), angle at `v`, other corners, and facet.
+/// Calls `with` for every triangle of the surface at `v`: its outward normal (twice the area long), its angle at `v`, rad, other
+/// corners, and facet.
 fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, f64, [u32; 2], u32)) {
     let delaunay = &body.delaunay;
     for code in body.stars.of(v) {
@@ -112,25 +118,75 @@ fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, f64, [u32; 2], 
             let others = [corners[(at_v + 1) % 3], corners[(at_v + 2) % 3]];
             let p = delaunay.points[v as usize];
             let [u, w] = others.map(|u| delaunay.points[u as usize] - p);
-            with(
-                normal,
-                u.angle_between(w),
-                others,
-                facet(delaunay, cell, at),
-            );
+            let angle = u.cross(w).length().atan2(u.dot(w));
+            with(normal, angle, others, facet(delaunay, cell, at));
         }
     }
 }
 
+/// Outward normals of the triangles at `v`, weighted by matching index times angle (Ma 2011, equation 4.6).
 fn ring_sum(body: &Body, v: u32) -> DVec3 {
     let mut sum = DVec3::ZERO;
     triangles_at(body, v, |normal, angle, _, facet| {
-        let weight = f64::from(body.facets.matches(facet).max(1)) * angle;
-        if weight.is_finite() {
-            sum += normal.normalize_or_zero() * weight;
+        let matches = f64::from(body.facets.matches(facet).max(1));
+        let term = normal.normalize_or_zero() * (matches * angle);
+        if term.is_finite() {
+            sum += term;
         }
     });
     sum
+}
+
+/// The normal of the cubic height function through `v` and the corners of both rings, or none where the surface does not turn smoothly there.
+fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
+    /// One more than coefficients.
+    const LEAST_POINTS: usize = 14;
+    /// Slopes above this are no correction of the normal but another surface.
+    const STEEPEST: f64 = 0.3;
+    let own = one[v as usize];
+    let mut around = Vec::new();
+    triangles_at(body, v, |_, _, others, _| around.extend(others));
+    for i in 0..around.len() {
+        triangles_at(body, around[i], |_, _, others, _| around.extend(others));
+    }
+    around.sort_unstable();
+    around.dedup();
+    around.retain(|u| *u != v);
+    let is_smooth = around
+        .iter()
+        .all(|u| one[*u as usize].dot(own) > BEYOND_EDGE);
+    if around.len() < LEAST_POINTS || !is_smooth {
+        return None;
+    }
+    let p = body.delaunay.points[v as usize];
+    let x = own.any_orthonormal_vector();
+    let y = own.cross(x);
+    let ways: Vec<DVec3> = around
+        .iter()
+        .map(|u| body.delaunay.points[*u as usize] - p)
+        .collect();
+    let reach = ways.iter().map(|d| d.length()).fold(0.0, f64::max);
+    let mut sums = NormalSums::<9>::default();
+    for d in &ways {
+        let (a, b) = (d.dot(x) / reach, d.dot(y) / reach);
+        // Steep in the distance: what a cubic leaves out grows with the fourth power.
+        let weight = (reach * reach / d.length_squared()).powi(2);
+        let row = [
+            a,
+            b,
+            a * a,
+            a * b,
+            b * b,
+            a * a * a,
+            a * a * b,
+            a * b * b,
+            b * b * b,
+        ];
+        sums.add(&row, d.dot(own) / reach, weight);
+    }
+    let ([a, b, ..], _) = sums.solve()?;
+    let is_close = a.hypot(b) < STEEPEST;
+    is_close.then(|| (own - x * a - y * b).normalize())
 }
 
 /// The triangles of both rings weighted by area, those beyond an edge left out.
