@@ -4,6 +4,8 @@
 //! points) by default. Speeds are also given as ratios to a reference of the same run: twenty neighbours of every point on a k-d tree, one
 //! thread. `PICTURES=FOLDER` writes shaded pictures of the meshes.
 
+#![allow(clippy::print_stdout)]
+
 use std::collections::HashSet;
 use std::time::Instant;
 

@@ -93,7 +93,7 @@ fn data(name: &str) -> Option<Vec<DVec3>> {
         .join("../shared/data")
         .join(name);
     if !path.exists() {
-        println!("passed by: {} is absent", path.display());
+        eprintln!("passed by: {} is absent", path.display());
         return None;
     }
     Some(

@@ -56,7 +56,7 @@ fn check_cell(delaunay: &Delaunay, signs: &Signs, cell: u32) -> Result<(), Strin
             return Err(format!("cell {cell}: flat or turned inside out"));
         }
     }
-    for k in 0..4 {
+    for (k, facet) in FACETS.iter().enumerate() {
         let neighbor = delaunay.neighbors[cell as usize][k];
         let mirror = delaunay.mirror(cell, neighbor);
         if delaunay.neighbors[neighbor as usize][mirror] != cell {
@@ -64,7 +64,7 @@ fn check_cell(delaunay: &Delaunay, signs: &Signs, cell: u32) -> Result<(), Strin
                 "cell {cell}: its neighbour {neighbor} does not know it"
             ));
         }
-        let mut own = FACETS[k].map(|f| corners[f]);
+        let mut own = facet.map(|f| corners[f]);
         let other = delaunay.cells[neighbor as usize];
         let mut its = FACETS[mirror].map(|f| other[f]);
         own.sort_unstable();

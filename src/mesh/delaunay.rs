@@ -85,9 +85,10 @@ impl Delaunay {
         if let Some(index) = positions.iter().position(|p| !p.is_finite()) {
             return Err(DelaunayError::NotFinite { index });
         }
-        let (points, scale) = without_extremes(positions);
-        let (sources, vertex_of) = along_hilbert_curve(&points);
-        let points: Vec<DVec3> = sources.iter().map(|i| points[*i as usize]).collect();
+        let (all, scale) = without_extremes(positions);
+        let (sources, vertex_of) = along_hilbert_curve(&all);
+        let points: Vec<DVec3> = sources.iter().map(|i| all[*i as usize]).collect();
+        drop(all);
         let order = in_rounds(points.len());
         let first = first_cell(&points, &order)?;
         let mut builder = Builder::new(points, first);
@@ -241,9 +242,9 @@ impl Builder {
         let mut neighbors = Vec::with_capacity(room);
         cells.push(first);
         neighbors.push([1, 2, 3, 4]);
-        for at in 0..4 {
+        for facet in FACETS {
             // The ghost stands across the facet, which is seen from outside in the other sense.
-            let [a, b, c] = FACETS[at].map(|k| first[k]);
+            let [a, b, c] = facet.map(|k| first[k]);
             cells.push([b, a, c, GHOST]);
             let ghost = |corner: u32| 1 + place(&first, corner) as u32;
             neighbors.push([ghost(b), ghost(a), ghost(c), 0]);
@@ -293,12 +294,12 @@ impl Builder {
         'walk: loop {
             let corners = self.cells[cell as usize];
             let corner_points = corners.map(|c| self.at(c));
-            for at in 0..4 {
-                let next = self.neighbors[cell as usize][at];
+            let neighbors = self.neighbors[cell as usize];
+            for (next, facet) in neighbors.into_iter().zip(&FACETS) {
                 if next == from {
                     continue;
                 }
-                let [a, b, c] = FACETS[at].map(|k| corner_points[k]);
+                let [a, b, c] = facet.map(|k| corner_points[k]);
                 if self.signs.orient(a, b, c, p) < 0.0 {
                     from = cell;
                     cell = next;

@@ -85,8 +85,8 @@ impl Quad {
         // The facets opposite to the ends of `new` are on the surface.
         let (mut old, mut new) = ([0; 2], [0; 2]);
         let (mut o, mut n) = (0, 0);
-        for at in 0..4 {
-            if on_surface[at] {
+        for (at, is_on) in on_surface.into_iter().enumerate() {
+            if is_on {
                 new[n] = at;
                 n += 1;
             } else {
