@@ -15,6 +15,7 @@ use rayon::prelude::*;
 mod clouds;
 
 use clouds::Sampled;
+use clouds::models::fandisk;
 use clouds::score::{cloud, oracle, score_classes};
 use clouds::solids;
 
@@ -138,32 +139,6 @@ fn rows() -> Vec<Row> {
         }));
     }
     rows
-}
-
-/// Area samples of the fandisk, sharp where its faces turn by more than 25 degrees; none where the data folder is absent.
-fn fandisk(count: usize) -> Option<Sampled> {
-    let path = concat!(
-        env!("CARGO_MANIFEST_DIR"),
-        "/../shared/data/models/fandisk.obj"
-    );
-    let text = std::fs::read_to_string(path).ok()?;
-    let (mut vertices, mut faces) = (Vec::new(), Vec::new());
-    for line in text.lines() {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        match words.first() {
-            Some(&"v") => {
-                let x: Vec<f64> = words[1..4].iter().filter_map(|w| w.parse().ok()).collect();
-                vertices.push(DVec3::from_slice(&x));
-            }
-            Some(&"f") => {
-                let corner = |w: &str| w.split('/').next().and_then(|i| i.parse::<usize>().ok());
-                let f: Vec<usize> = words[1..4].iter().filter_map(|w| corner(w)).collect();
-                faces.push([f[0] - 1, f[1] - 1, f[2] - 1]);
-            }
-            _ => {}
-        }
-    }
-    Some(clouds::score::mesh(&vertices, &faces, count, 25.0))
 }
 
 /// Keeps the number of points near the same for all ratios.

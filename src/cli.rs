@@ -5,7 +5,9 @@ mod demo;
 mod detect;
 mod devices;
 mod inspect;
+mod mesh;
 mod nominal;
+mod normals;
 mod progress;
 mod reconstruct;
 mod simulate;
@@ -29,6 +31,10 @@ pub enum Command {
     Detect(detect::Detect),
     /// Project a scan onto its surface, keeping edges sharp.
     Reconstruct(reconstruct::Reconstruct),
+    /// Mesh a scan: watertight, manifold, through every point.
+    Mesh(mesh::Mesh),
+    /// Find the outward normal at every point of a scan.
+    Normals(normals::NormalsCommand),
     /// Say what a CAD file holds: faces, edges, sharp edges, and what was refused.
     Nominal(nominal::Nominals),
     /// Say everything that is wrong with a cell's configuration, touching no device.
@@ -50,6 +56,8 @@ impl Command {
             Command::Inspect(command) => command.run(),
             Command::Detect(command) => command.run(),
             Command::Reconstruct(command) => command.run(),
+            Command::Mesh(command) => command.run(),
+            Command::Normals(command) => command.run(),
             Command::Nominal(command) => command.run(),
             Command::Check(command) => command.run(),
             Command::Devices(command) => command.run(),

@@ -12,6 +12,8 @@ pub mod features;
 
 pub mod surface;
 
+pub mod mesh;
+
 pub mod nominal;
 
 pub mod inspect;

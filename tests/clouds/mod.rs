@@ -8,6 +8,7 @@ use std::f64::consts::TAU;
 
 use glam::{DVec2, DVec3};
 
+pub mod fandisk;
 pub mod models;
 pub mod score;
 pub mod solids;

@@ -28,22 +28,8 @@ fn vector(words: &[&str]) -> DVec3 {
 
 /// `count` area samples of the fandisk.
 pub fn fandisk(count: usize) -> Option<Sampled> {
-    let text = fs::read_to_string(data("models/fandisk.obj")).ok()?;
-    let (mut vertices, mut faces) = (Vec::new(), Vec::new());
-    for line in text.lines() {
-        let words: Vec<&str> = line.split_whitespace().collect();
-        match words.as_slice() {
-            ["v", xyz @ ..] => vertices.push(vector(xyz)),
-            ["f", corners @ ..] => {
-                let corner = |k: usize| -> usize {
-                    let number = corners[k].split('/').next().unwrap_or_default();
-                    number.parse::<usize>().expect("a vertex") - 1
-                };
-                faces.push([corner(0), corner(1), corner(2)]);
-            }
-            _ => {}
-        }
-    }
+    let (vertices, faces) = super::fandisk::model()?;
+    let faces: Vec<[usize; 3]> = faces.iter().map(|f| f.map(|v| v as usize)).collect();
     Some(mesh(&vertices, &faces, count, SHARP_DEG))
 }
 

@@ -1,0 +1,517 @@
+//! The figures of triangulation, meshes and normals, each row beside the aim or the author's number.
+//!
+//! `cargo bench --bench mesh -- PART...` with the parts `delaunay`, `table52`, `peers`, `normals`, `sharp`, `large`; all but `large` (ten million
+//! points) by default. Speeds are also given as ratios to a reference of the same run: twenty neighbours of every point on a k-d tree, one
+//! thread. `PICTURES=FOLDER` writes shaded pictures of the meshes.
+
+#![allow(clippy::print_stdout)]
+
+use std::collections::HashSet;
+use std::time::Instant;
+
+use acies::mesh::{Body, Delaunay, Mesh, Rings, Settings, check_delaunay, mesh, normals, picture};
+use acies::points::{Neighbors, Unit, read};
+use acies::surface::{plane_normals, weighted_plane_normals};
+use glam::DVec3;
+
+#[path = "../tests/mesh/bodies.rs"]
+mod bodies;
+#[path = "../tests/clouds/mod.rs"]
+mod clouds;
+
+use clouds::score::cloud;
+use clouds::{Line, Random, solids};
+
+/// A file of the data folder, or none, said aloud.
+fn data(name: &str) -> Option<Vec<DVec3>> {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../shared/data")
+        .join(name);
+    let found = read(&path, Unit::Millimetre)
+        .ok()
+        .map(|r| r.cloud.positions);
+    if found.is_none() {
+        println!("skipped: {} is absent", path.display());
+    }
+    found
+}
+
+fn timed<T>(work: impl FnOnce() -> T) -> (T, f64) {
+    let start = Instant::now();
+    let done = work();
+    (done, start.elapsed().as_secs_f64())
+}
+
+/// Seconds for twenty neighbours of every point, tree included, on one thread.
+fn reference(points: &[DVec3]) -> f64 {
+    let work = || {
+        let neighbors = Neighbors::new(points);
+        let mut found = Vec::new();
+        let mut sum = 0.0;
+        for i in neighbors.order() {
+            neighbors.nearest(points[*i as usize], 20, &mut found);
+            sum += found.last().map_or(0.0, |f| f.1);
+        }
+        sum
+    };
+    let (sum, seconds) = timed(work);
+    assert!(sum >= 0.0);
+    seconds
+}
+
+/// Most memory that the program has held so far, GB, where the system says.
+fn peak_gb() -> f64 {
+    let text = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let line = text.lines().find(|l| l.starts_with("VmHWM:"));
+    let kb = line.and_then(|l| l.split_whitespace().nth(1)?.parse::<f64>().ok());
+    kb.unwrap_or(f64::NAN) / 1e6
+}
+
+fn grid(steps: usize) -> Vec<DVec3> {
+    let at = |i: usize| {
+        DVec3::new(
+            (i % steps) as f64,
+            (i / steps % steps) as f64,
+            (i / steps / steps) as f64,
+        )
+    };
+    (0..steps * steps * steps).map(at).collect()
+}
+
+/// Spheres far apart with ten exactly cospherical points each: corners of a box and two more on its sphere.
+fn tens_on_spheres(spheres: usize) -> Vec<DVec3> {
+    let mut random = Random::new(5);
+    let mut points = Vec::with_capacity(10 * spheres);
+    for _ in 0..spheres {
+        let centre = DVec3::new(random.unit(), random.unit(), random.unit()) * 4096.0;
+        let centre = centre.round();
+        for i in 0..8 {
+            let sign = |bit: i32| if i & bit == 0 { -1.0 } else { 1.0 };
+            points.push(centre + DVec3::new(sign(1), 2.0 * sign(2), 2.0 * sign(4)));
+        }
+        // 1 + 4 + 4 = 9 = 3².
+        points.push(centre + DVec3::X * 3.0);
+        points.push(centre - DVec3::Y * 3.0);
+    }
+    points
+}
+
+fn delaunay() {
+    println!(
+        "\ncloud                      points      cells  seconds  ratio to 20 neighbours   checked"
+    );
+    let mut rows: Vec<(&str, Vec<DVec3>, Option<usize>)> = Vec::new();
+    if let Some(bunny) = data("models/stanford-bunny.obj") {
+        rows.push(("bunny", bunny, Some(246_215)));
+    }
+    rows.push((
+        "ellipsoid 36k",
+        bodies::ellipsoid(36_000, DVec3::new(1.0, 2.0, 4.0)).points,
+        None,
+    ));
+    rows.push((
+        "part500k",
+        solids::block().sample(500_000, 0.1, 1).points,
+        None,
+    ));
+    rows.push((
+        "part2M",
+        solids::block().sample(2_000_000, 0.1, 1).points,
+        None,
+    ));
+    rows.push(("grid 100^3", grid(100), None));
+    rows.push(("tens on spheres 1M", tens_on_spheres(100_000), None));
+    let mut copies = vec![DVec3::ONE; 10_000];
+    copies.extend(grid(3));
+    rows.push(("10,000 copies and 3^3", copies, None));
+    for (name, points, known) in rows {
+        let (first, mut seconds) = timed(|| Delaunay::new(&points).expect("a body"));
+        let checked = check_delaunay(&first);
+        let cells = first.finite_cells();
+        drop(first);
+        if points.len() <= 500_000 {
+            for _ in 0..2 {
+                seconds = seconds.min(timed(|| Delaunay::new(&points)).1);
+            }
+        }
+        let ratio = seconds / reference(&points);
+        let note = known.map_or(String::new(), |k| format!(", known {k}"));
+        println!(
+            "{name:22} {:10} {cells:10} {seconds:8.3} {ratio:12.2}     {checked:?}{note}",
+            points.len()
+        );
+    }
+}
+
+fn row(name: &str, points: &[DVec3], genus: i64, settings: Settings) -> Mesh {
+    let (made, seconds) = timed(|| mesh(points, settings).expect("a body"));
+    let t = made.topology;
+    let expected = 2 * made.positions.len() as i64 + 4 * (genus - 1);
+    let right = t.genus() == Some(genus) && t.pieces == 1 && t.triangles as i64 == expected;
+    println!(
+        "{name:24} {:8} {:9} / {expected:9} {:7.2} {:8.3} {:6} {seconds:8.2}  {}",
+        made.positions.len(),
+        t.triangles,
+        made.matched_by_umbrellas_percent(),
+        made.matched_percent(),
+        (expected - t.triangles as i64).abs(),
+        if right {
+            "closed, true genus".to_owned()
+        } else {
+            format!("< {t:?}")
+        },
+    );
+    let stages: Vec<String> = made
+        .seconds
+        .iter()
+        .map(|(n, s)| format!("{n} {s:.2}"))
+        .collect();
+    println!("    {}", stages.join(", "));
+    if let Ok(folder) = std::env::var("PICTURES") {
+        let sight = DVec3::new(0.5, 0.7, -0.6);
+        let bytes = picture::render(&made.positions, &made.triangles, sight, (1200, 900));
+        let path = format!("{folder}/{}.png", name.replace([' ', '%', '.'], "-"));
+        println!("    picture {path}: {:?}", std::fs::write(&path, bytes));
+    }
+    made
+}
+
+fn head() {
+    println!(
+        "\ncloud                    vertices  triangles /  expected  umbr. % matched %  dF    seconds"
+    );
+}
+
+/// Table 5.2: 100 % and Delta F 0 everywhere, with the cone; Delta F here against the true genus.
+fn table52() {
+    println!("\nMa 2011, table 5.2: bunny 72.4 s, fandisk 9.2 s, cube with hole 3.9 s");
+    head();
+    let settings = Settings::default();
+    if let Some(bunny) = data("models/stanford-bunny.obj") {
+        row("bunny", &bunny, 0, settings);
+    }
+    if let Some(fandisk) = data("models/fandisk.obj") {
+        row("fandisk", &fandisk, 0, settings);
+    }
+    row(
+        "cube with hole 2,224",
+        &solids::cube_with_hole(10.0).even(2_224, 280).points,
+        1,
+        settings,
+    );
+    row(
+        "block 40,000",
+        &solids::block().sample(40_000, 0.0, 1).points,
+        2,
+        settings,
+    );
+    row("torus 3,600", &bodies::torus(60, 60).points, 1, settings);
+    row(
+        "ellipsoid 9,950",
+        &bodies::ellipsoid(9_950, DVec3::new(1.0, 2.0, 4.0)).points,
+        0,
+        settings,
+    );
+    row(
+        "three holes 4,000",
+        &bodies::three_holes().even(4_000, 500).points,
+        3,
+        settings,
+    );
+}
+
+/// Links along true edges, for clouds whose points on edges come first and in order.
+///
+/// Where a point of a face lies too near an edge the link there is no edge of the Delaunay triangulation, and no mesh made of it can have it.
+fn links(made: &Mesh, sampled: &clouds::Sampled) {
+    let ordered = |a: u32, b: u32| (a.min(b), a.max(b));
+    let edges: HashSet<(u32, u32)> = (made.triangles.iter())
+        .flat_map(|t| {
+            [
+                ordered(t[0], t[1]),
+                ordered(t[1], t[2]),
+                ordered(t[2], t[0]),
+            ]
+        })
+        .collect();
+    let delaunay = Delaunay::new(&sampled.points).expect("a body");
+    let source = |v: u32| {
+        delaunay
+            .sources
+            .get(v as usize)
+            .copied()
+            .unwrap_or(u32::MAX)
+    };
+    let possible: HashSet<(u32, u32)> = (delaunay.cells.iter())
+        .map(|c| c.map(source))
+        .flat_map(|c| {
+            [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].map(|(i, j)| ordered(c[i], c[j]))
+        })
+        .collect();
+    let on_edge = sampled.on_edge.iter().filter(|o| **o).count() as u32;
+    let along = |i: &u32| {
+        let [a, b] = [*i - 1, *i].map(|i| sampled.points[i as usize]);
+        // Made there; rounding only.
+        let is_on = |l: &Line| l.distance(a) < 1e-9 && l.distance(b) < 1e-9;
+        sampled.edges.iter().any(is_on)
+    };
+    let all: Vec<u32> = (1..on_edge).filter(along).collect();
+    let found = all
+        .iter()
+        .filter(|i| edges.contains(&(**i - 1, **i)))
+        .count();
+    let most = all
+        .iter()
+        .filter(|i| possible.contains(&(**i - 1, **i)))
+        .count();
+    println!(
+        "    {found} of {} links along the true edges; {most} are in the triangulation",
+        all.len()
+    );
+}
+
+fn peers() {
+    println!("\npeers.md: best of them leaves these open or incomplete");
+    head();
+    let settings = Settings::default();
+    for (name, sampled, genus) in [
+        ("cube 10,250", solids::cube(10.0).even(10_250, 580), 0),
+        (
+            "hole 17,400",
+            solids::cube_with_hole(10.0).even(17_400, 839),
+            1,
+        ),
+        (
+            "hole 58,720",
+            solids::cube_with_hole(10.0).even(58_720, 1_350),
+            1,
+        ),
+    ] {
+        let made = row(name, &sampled.points, genus, settings);
+        links(&made, &sampled);
+    }
+    for percent in [0.4, 0.8, 1.2, 2.0] {
+        let clean = solids::cube_with_hole(10.0).even(17_400, 839);
+        let reach = percent / 100.0 * 8.5 / 0.25 * clean.spacing;
+        row(
+            &format!("hole 17,400 noise {percent} %"),
+            &clean.shaken(reach, 5).points,
+            1,
+            settings,
+        );
+    }
+    if let Some((vertices, faces)) = clouds::fandisk::model() {
+        let faces: Vec<[usize; 3]> = faces.iter().map(|f| f.map(|v| v as usize)).collect();
+        let sampled = clouds::score::mesh(&vertices, &faces, 41_250, 25.0);
+        row("fandisk 41,250", &sampled.points, 0, settings);
+    }
+    row(
+        "part500k noise 0.1 s",
+        &solids::block().sample(500_000, 0.1, 1).points,
+        2,
+        settings,
+    );
+}
+
+fn normal_rows() {
+    println!("\nMa 2011, table 4.1: mean, root mean square, standard deviation, rad");
+    println!(
+        "{:12} {:16} {:>8} {:>8} {:>8}",
+        "cloud", "method", "mean", "rms", "std"
+    );
+    let mut rows = vec![
+        (
+            "torus 3600",
+            bodies::torus(60, 60),
+            [0.00105, 0.00120, 0.00058],
+        ),
+        (
+            "ellipsoid",
+            bodies::ellipsoid(9_950, DVec3::new(1.0, 2.0, 4.0)),
+            [0.00126, 0.00176, 0.00174],
+        ),
+    ];
+    if let Some((points, faces)) = clouds::fandisk::model() {
+        let mut sums = vec![DVec3::ZERO; points.len()];
+        for f in &faces {
+            let [a, b, c] = f.map(|v| points[v as usize]);
+            f.iter()
+                .for_each(|v| sums[*v as usize] += (b - a).cross(c - a));
+        }
+        let truth = sums.iter().map(|n| n.normalize_or_zero()).collect();
+        let known = bodies::Known {
+            points,
+            normals: truth,
+        };
+        rows.push(("fandisk 6475", known, [0.01791, 0.07970, 0.07766]));
+    }
+    rows.push(("cube 866", cube_866(), [0.03122, 0.10691, 0.10231]));
+    for (name, known, author) in &rows {
+        let cloud = cloud(&known.points);
+        let neighbors = Neighbors::new(&cloud.positions);
+        let body = Body::new(&cloud.positions, Settings::default()).expect("a body");
+        let found = normals(&body, &cloud, &neighbors, Rings::Auto);
+        let all = [
+            ("umbrella", bodies::errors(&found.normals, &known.normals)),
+            (
+                "plane",
+                bodies::errors(
+                    &plane_normals(&cloud.positions, &neighbors, 30),
+                    &known.normals,
+                ),
+            ),
+            (
+                "weighted plane",
+                bodies::errors(
+                    &weighted_plane_normals(&cloud.positions, &neighbors, 40),
+                    &known.normals,
+                ),
+            ),
+            ("(author)", *author),
+        ];
+        for (method, [mean, rms, std]) in all {
+            println!("{name:12} {method:16} {mean:8.5} {rms:8.5} {std:8.5}");
+        }
+    }
+    println!("\nfigures 4.11 and 4.12: torus of 10,000, mean error, rad");
+    println!("noise    one ring  two rings  automatic  plane 30");
+    let clean = bodies::torus(125, 80);
+    for level in [0.0, 0.04, 0.08, 0.12, 0.16, 0.2] {
+        // The author's unit: the mean distance to ten neighbours, 1.2 spacings here.
+        let spacing = (4.0 * std::f64::consts::PI.powi(2) * 40.0 / 10_000.0).sqrt();
+        let cloud = cloud(&bodies::shaken(&clean.points, level * 1.2 * spacing, 3));
+        let neighbors = Neighbors::new(&cloud.positions);
+        let body = Body::new(&cloud.positions, Settings::default()).expect("a body");
+        let error = |rings| {
+            bodies::errors(
+                &normals(&body, &cloud, &neighbors, rings).normals,
+                &clean.normals,
+            )[0]
+        };
+        let plane = bodies::errors(
+            &plane_normals(&cloud.positions, &neighbors, 30),
+            &clean.normals,
+        )[0];
+        println!(
+            "{level:5.2} {:10.4} {:10.4} {:10.4} {plane:10.4}",
+            error(Rings::One),
+            error(Rings::Two),
+            error(Rings::Auto)
+        );
+    }
+}
+
+/// 866 points of a cube's lattice of twelve steps, with the mean of the normals of their faces.
+fn cube_866() -> bodies::Known {
+    let mut known = bodies::Known {
+        points: Vec::new(),
+        normals: Vec::new(),
+    };
+    let n = 12;
+    for i in 0..(n + 1) * (n + 1) * (n + 1) {
+        let c = [i % (n + 1), i / (n + 1) % (n + 1), i / (n + 1) / (n + 1)];
+        let out = c.map(|c| {
+            if c == 0 {
+                -1.0
+            } else if c == n {
+                1.0
+            } else {
+                0.0
+            }
+        });
+        let normal = DVec3::from_array(out);
+        if normal != DVec3::ZERO {
+            known.points.push(DVec3::from_array(c.map(|c| c as f64)));
+            known.normals.push(normal.normalize());
+        }
+    }
+    known
+}
+
+fn sharp() {
+    println!(
+        "\nsharp edges of the model that are edges of the mesh; aim 99.5 % with the cone filter and the exchange of diagonals"
+    );
+    let mut rows: Vec<(&str, Vec<DVec3>, Vec<(u32, u32)>)> = Vec::new();
+    if let Some((points, _)) = clouds::fandisk::model() {
+        rows.push((
+            "fandisk, 25 degrees",
+            points,
+            clouds::fandisk::sharp_edges(25.0),
+        ));
+    }
+    for name in ["mechpart.recon.m", "standingblob.orig.m"] {
+        rows.extend(labelled(name).map(|(points, edges)| (name, points, edges)));
+    }
+    for (name, points, edges) in rows {
+        for cone in [false, true] {
+            let made = mesh(&points, Settings { cone, open: false }).expect("a body");
+            let has: HashSet<(u32, u32)> = (made.triangles.iter())
+                .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
+                .map(|(a, b)| (made.sources[a as usize], made.sources[b as usize]))
+                .map(|(a, b)| (a.min(b), a.max(b)))
+                .collect();
+            let found = edges.iter().filter(|e| has.contains(e)).count();
+            println!(
+                "{name:22} cone {cone:5} {found:5} of {:5} {:6.2} %  matched {:.2} %, genus {:?}, {:?}",
+                edges.len(),
+                100.0 * found as f64 / edges.len() as f64,
+                made.matched_percent(),
+                made.topology.genus(),
+                made.mending,
+            );
+        }
+    }
+}
+
+/// Points and sharp edges of a Hoppe mesh file, or none where the data folder is absent.
+fn labelled(name: &str) -> Option<(Vec<DVec3>, Vec<(u32, u32)>)> {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../shared/data/sharp-labels")
+        .join(name);
+    let text = std::fs::read_to_string(path).ok()?;
+    let mut numbers = std::collections::HashMap::new();
+    let (mut points, mut edges) = (Vec::new(), Vec::new());
+    for line in text.lines() {
+        let words: Vec<&str> = line.split_whitespace().collect();
+        if words.first() == Some(&"Vertex") {
+            let x: Vec<f64> = words[2..5].iter().filter_map(|w| w.parse().ok()).collect();
+            numbers.insert(words[1].to_owned(), points.len() as u32);
+            points.push(DVec3::from_slice(&x));
+        } else if words.first() == Some(&"Edge") && line.contains("sharp") {
+            let (a, b) = (numbers[words[1]], numbers[words[2]]);
+            edges.push((a.min(b), a.max(b)));
+        }
+    }
+    Some((points, edges))
+}
+
+fn large() {
+    println!("\nten million points; aim: below 8 GB");
+    let points = solids::block().sample(10_000_000, 0.1, 1).points;
+    println!("    {:.2} GB before", peak_gb());
+    head();
+    row("block 10,000,000", &points, 2, Settings::default());
+    println!("    {:.2} GB at the most", peak_gb());
+}
+
+fn main() {
+    let wanted: Vec<String> = std::env::args()
+        .skip(1)
+        .filter(|a| !a.starts_with("--"))
+        .collect();
+    let parts: [(&str, fn()); 6] = [
+        ("delaunay", delaunay),
+        ("table52", table52),
+        ("peers", peers),
+        ("normals", normal_rows),
+        ("sharp", sharp),
+        ("large", large),
+    ];
+    for (name, part) in parts {
+        let is_wanted = wanted.iter().any(|w| w == name) || (wanted.is_empty() && name != "large");
+        if is_wanted {
+            part();
+        }
+    }
+}

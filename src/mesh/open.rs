@@ -1,0 +1,180 @@
+//! Surfaces with borders: the part of a closed surface that was seen.
+//!
+//! A scan is open nearly always. Closed, its mesh bridges what was never seen by triangles far larger than the spacing around; these are
+//! left out. Of a sheet, which bounds no body, the matched facets are taken, as the thesis leaves them (Ma 2011, §3.4).
+
+use std::collections::HashMap;
+
+use super::Body;
+use super::delaunay::{Delaunay, GHOST};
+use super::solid::surface;
+use super::star::vertices;
+
+/// A triangle bridges where an edge of it is longer than so many times the typical edges at its ends: a scan line is up to twenty
+/// times denser along than across, and there typical is the longer.
+const BRIDGE: f64 = 4.0;
+/// Share of wrong vertices after the vote from which on the points are no body.
+const SHEET: f64 = 0.05;
+
+/// The triangles of the body's surface that bridge nothing, as a manifold with borders.
+pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
+    let delaunay = &body.delaunay;
+    let is_sheet = body.mending.before as f64 > SHEET * delaunay.points.len() as f64;
+    let mut triangles = if is_sheet {
+        oriented(matched(body))
+    } else {
+        surface(delaunay, &body.solid.inside)
+    };
+    let typical = typical_edges(delaunay, &triangles);
+    let most = longest_seen(&typical);
+    triangles.retain(|t| {
+        (0..3).all(|k| {
+            let (a, b) = (t[k], t[(k + 1) % 3]);
+            let length = delaunay.points[a as usize].distance(delaunay.points[b as usize]);
+            length <= (BRIDGE * typical[a as usize].min(typical[b as usize])).min(most)
+        })
+    });
+    one_fan_each(delaunay.points.len(), triangles)
+}
+
+fn matched(body: &Body) -> Vec<[u32; 3]> {
+    let delaunay = &body.delaunay;
+    (0..4 * delaunay.cells.len() as u32)
+        .filter(|f| delaunay.neighbors[(f >> 2) as usize][(f & 3) as usize] > f >> 2)
+        .filter(|f| body.facets.matches(*f) == 3)
+        .map(|f| vertices(delaunay, f))
+        .filter(|t| !t.contains(&GHOST))
+        .collect()
+}
+
+/// The triangles with neighbours turned alike, from the first of every piece on.
+fn oriented(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
+    let mut at: HashMap<(u32, u32), Vec<u32>> = HashMap::with_capacity(2 * triangles.len());
+    for (i, t) in triangles.iter().enumerate() {
+        for k in 0..3 {
+            let (a, b) = (t[k], t[(k + 1) % 3]);
+            at.entry((a.min(b), a.max(b))).or_default().push(i as u32);
+        }
+    }
+    let mut is_done = vec![false; triangles.len()];
+    let mut stack = Vec::new();
+    for start in 0..triangles.len() {
+        if std::mem::replace(&mut is_done[start], true) {
+            continue;
+        }
+        stack.push(start);
+        while let Some(i) = stack.pop() {
+            let t = triangles[i];
+            for k in 0..3 {
+                let (a, b) = (t[k], t[(k + 1) % 3]);
+                for &j in &at[&(a.min(b), a.max(b))] {
+                    let j = j as usize;
+                    if !std::mem::replace(&mut is_done[j], true) {
+                        let other = &mut triangles[j];
+                        if (0..3).any(|k| other[k] == a && other[(k + 1) % 3] == b) {
+                            other.swap(0, 1);
+                        }
+                        stack.push(j);
+                    }
+                }
+            }
+        }
+    }
+    // What could not be turned alike parts at its edges.
+    let mut seen: HashMap<(u32, u32), ()> = HashMap::new();
+    triangles.retain(|t| {
+        let sides = [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])];
+        let is_new = sides.iter().all(|s| !seen.contains_key(s));
+        if is_new {
+            seen.extend(sides.map(|s| (s, ())));
+        }
+        is_new
+    });
+    triangles
+}
+
+/// For every vertex the median of the lengths of its triangles' edges.
+fn typical_edges(delaunay: &Delaunay, triangles: &[[u32; 3]]) -> Vec<f64> {
+    let mut lengths: Vec<Vec<f32>> = vec![Vec::new(); delaunay.points.len()];
+    for t in triangles {
+        for k in 0..3 {
+            let (a, b) = (t[k], t[(k + 1) % 3]);
+            let length = delaunay.points[a as usize].distance(delaunay.points[b as usize]) as f32;
+            lengths[a as usize].push(length);
+            lengths[b as usize].push(length);
+        }
+    }
+    let typical = |all: &mut Vec<f32>| {
+        if all.is_empty() {
+            return 0.0;
+        }
+        let at = (all.len() - 1) / 2;
+        f64::from(*all.select_nth_unstable_by(at, f32::total_cmp).1)
+    };
+    lengths.iter_mut().map(typical).collect()
+}
+
+/// Length above which an edge bridges whatever its surroundings: along a border even typical edges may be bridges.
+fn longest_seen(typical: &[f64]) -> f64 {
+    let mut all: Vec<f64> = typical.iter().copied().filter(|l| *l > 0.0).collect();
+    if all.is_empty() {
+        return f64::INFINITY;
+    }
+    let at = (all.len() - 1) * 9 / 10;
+    BRIDGE * *all.select_nth_unstable_by(at, f64::total_cmp).1
+}
+
+/// Leaves every vertex one fan or ring of triangles, the largest.
+fn one_fan_each(vertices: usize, mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
+    loop {
+        let mut at: Vec<Vec<u32>> = vec![Vec::new(); vertices];
+        for (i, t) in triangles.iter().enumerate() {
+            t.iter().for_each(|v| at[*v as usize].push(i as u32));
+        }
+        let mut is_kept = vec![true; triangles.len()];
+        let mut found = false;
+        for v in 0..vertices as u32 {
+            let own = &at[v as usize];
+            let fans = fans(v, own, &triangles);
+            let mut sizes: HashMap<u32, usize> = HashMap::new();
+            fans.iter().for_each(|f| *sizes.entry(*f).or_default() += 1);
+            let Some((&largest, _)) = sizes
+                .iter()
+                .max_by_key(|(f, n)| (**n, std::cmp::Reverse(**f)))
+            else {
+                continue;
+            };
+            for (i, fan) in own.iter().zip(&fans) {
+                if *fan != largest {
+                    is_kept[*i as usize] = false;
+                    found = true;
+                }
+            }
+        }
+        if !found {
+            return triangles;
+        }
+        let mut kept = is_kept.iter();
+        triangles.retain(|_| kept.next().copied().unwrap_or(true));
+    }
+}
+
+/// For every triangle at `v` which fan it belongs to: those that share an edge at `v`.
+fn fans(v: u32, own: &[u32], triangles: &[[u32; 3]]) -> Vec<u32> {
+    let mut fan: Vec<u32> = (0..own.len() as u32).collect();
+    let shares = |i: u32, j: u32| {
+        let (s, t) = (triangles[i as usize], triangles[j as usize]);
+        s.iter().any(|x| *x != v && t.contains(x))
+    };
+    for i in 0..own.len() {
+        for j in 0..i {
+            if fan[i] != fan[j] && shares(own[i], own[j]) {
+                let (low, high) = (fan[i].min(fan[j]), fan[i].max(fan[j]));
+                fan.iter_mut()
+                    .filter(|f| **f == high)
+                    .for_each(|f| *f = low);
+            }
+        }
+    }
+    fan
+}

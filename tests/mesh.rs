@@ -1,0 +1,549 @@
+//! Triangulations checked by their definitions, meshes by Euler's formula and exact bodies, normals by true ones.
+
+use std::path::Path;
+use std::process::Command;
+
+use acies::mesh::{
+    Body, Delaunay, DelaunayError, Mesh, Rings, Settings, check_delaunay, mesh, normals,
+    orient_normals, topology,
+};
+use acies::points::{Neighbors, Unit, read};
+use acies::surface::{plane_normals, weighted_plane_normals};
+use glam::DVec3;
+use proptest::prelude::*;
+
+#[path = "mesh/bodies.rs"]
+mod bodies;
+mod clouds;
+
+use clouds::score::cloud;
+use clouds::solids;
+
+/// The triangulation, checked.
+fn triangulated(points: &[DVec3]) -> Delaunay {
+    let delaunay = Delaunay::new(points).expect("points that span space");
+    if let Err(wrong) = check_delaunay(&delaunay) {
+        panic!("{} points: {wrong}", points.len());
+    }
+    delaunay
+}
+
+/// The closed mesh of all points, checked to be one.
+fn closed(name: &str, points: &[DVec3], genus: i64) -> Mesh {
+    let made = mesh(points, Settings::default()).expect("points that span space");
+    let t = made.topology;
+    assert!(
+        t.is_watertight() && t.is_manifold(),
+        "{name}: {t:?}, {:?}",
+        made.mending
+    );
+    assert_eq!(
+        t.vertices,
+        made.positions.len(),
+        "{name}: every point is a vertex"
+    );
+    assert_eq!((t.pieces, t.genus()), (1, Some(genus)), "{name}");
+    assert_eq!(
+        t.triangles as i64,
+        2 * t.vertices as i64 + 4 * (genus - 1),
+        "{name}"
+    );
+    assert_eq!(
+        (made.matched_percent(), made.delta_f()),
+        (100.0, 0),
+        "{name}"
+    );
+    made
+}
+
+fn volume(made: &Mesh) -> f64 {
+    let six: f64 = (made.triangles.iter())
+        .map(|t| {
+            let [a, b, c] = t.map(|v| made.positions[v as usize]);
+            a.dot(b.cross(c))
+        })
+        .sum();
+    six / 6.0
+}
+
+fn area(made: &Mesh) -> f64 {
+    let twice: f64 = (made.triangles.iter())
+        .map(|t| {
+            let [a, b, c] = t.map(|v| made.positions[v as usize]);
+            (b - a).cross(c - a).length()
+        })
+        .sum();
+    twice / 2.0
+}
+
+fn grid(steps: usize) -> Vec<DVec3> {
+    let at = |i: usize| {
+        DVec3::new(
+            (i % steps) as f64,
+            (i / steps % steps) as f64,
+            (i / steps / steps) as f64,
+        )
+    };
+    (0..steps * steps * steps).map(at).collect()
+}
+
+/// A file of the data folder, or none, said aloud, where the folder is absent.
+fn data(name: &str) -> Option<Vec<DVec3>> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../shared/data")
+        .join(name);
+    if !path.exists() {
+        eprintln!("passed by: {} is absent", path.display());
+        return None;
+    }
+    Some(
+        read(&path, Unit::Millimetre)
+            .expect("a readable model")
+            .cloud
+            .positions,
+    )
+}
+
+#[test]
+fn grids_and_cospherical_points_are_triangulated_without_flat_cells() {
+    for steps in [2, 3, 10] {
+        let delaunay = triangulated(&grid(steps));
+        // Each cube of the grid falls into five or six cells.
+        let cubes = (steps - 1).pow(3);
+        assert!((5 * cubes..=6 * cubes).contains(&delaunay.finite_cells()));
+    }
+    // All on spheres around the origin: integer points of equal length, exactly cospherical.
+    let range = -8i32..=8;
+    let shell: Vec<DVec3> = (range.clone())
+        .flat_map(|x| (-8i32..=8).map(move |y| (x, y)))
+        .flat_map(|(x, y)| (-8i32..=8).map(move |z| (x, y, z)))
+        .filter(|(x, y, z)| [81, 101].contains(&(x * x + y * y + z * z)))
+        .map(|(x, y, z)| DVec3::new(f64::from(x), f64::from(y), f64::from(z)))
+        .collect();
+    assert!(shell.len() > 150);
+    triangulated(&shell);
+    // A raster of scan lines over two planes.
+    let raster: Vec<DVec3> = (0..6_000)
+        .map(|i| {
+            let (x, y) = (f64::from(i % 200) * 0.1, f64::from(i / 200));
+            if x < 10.0 {
+                DVec3::new(x, y, 0.0)
+            } else {
+                DVec3::new(10.0, y, 10.0 - x)
+            }
+        })
+        .collect();
+    triangulated(&raster);
+}
+
+#[test]
+fn repeated_points_count_once_and_flat_sets_are_refused() {
+    let mut points = grid(4);
+    points.extend(vec![DVec3::ONE; 10_000]);
+    points.extend(grid(4));
+    let delaunay = triangulated(&points);
+    assert_eq!(delaunay.points.len(), 64);
+    for (i, v) in delaunay.vertex_of.iter().enumerate() {
+        assert_eq!(delaunay.points[*v as usize], points[i]);
+    }
+    assert!(
+        delaunay.sources.iter().all(|s| *s < 64),
+        "the first of equal points"
+    );
+
+    let refused = |points: &[DVec3]| Delaunay::new(points).map(|_| ()).unwrap_err();
+    let flat = |distinct, dimension| DelaunayError::Flat {
+        distinct,
+        dimension,
+    };
+    assert_eq!(refused(&[]), flat(0, 0));
+    assert_eq!(refused(&vec![DVec3::ONE; 10_000]), flat(1, 0));
+    let line: Vec<DVec3> = (0..100)
+        .map(|i| DVec3::new(1.0, 2.0, -3.0) * f64::from(i))
+        .collect();
+    assert_eq!(refused(&line), flat(100, 1));
+    let plane: Vec<DVec3> = grid(10)
+        .into_iter()
+        .map(|p| DVec3::new(p.x, p.y, p.x + p.y))
+        .collect();
+    assert_eq!(refused(&plane), flat(100, 2));
+    assert_eq!(
+        refused(&plane).to_string(),
+        "points: 100 distinct ones, all in one plane, expected a body in space"
+    );
+    assert_eq!(
+        refused(&[DVec3::ONE, DVec3::NAN]),
+        DelaunayError::NotFinite { index: 1 }
+    );
+}
+
+#[test]
+fn absurd_scales_are_survived() {
+    let mut cloud = bodies::ellipsoid(200, DVec3::new(1.0, 2.0, 3.0)).points;
+    cloud.push(DVec3::new(1e-310, -1e-200, 0.0));
+    for scale in [1e-300, 1e-60, 1.0, 1e60, 1e300] {
+        let scaled: Vec<DVec3> = cloud.iter().map(|p| *p * scale).collect();
+        assert_eq!(triangulated(&scaled).points.len(), 201, "{scale}");
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(96))]
+
+    #[test]
+    fn any_set_is_triangulated_and_its_order_does_not_matter(
+        raw in proptest::collection::vec((0u8..6, 0u8..6, 0u8..6), 5..120),
+        fine in proptest::collection::vec((-1.0f64..1.0, -1.0f64..1.0, -1.0f64..1.0), 0..60),
+        is_fine in any::<bool>(),
+    ) {
+        // Small whole numbers: most questions are degenerate.
+        let mut points: Vec<DVec3> = raw
+            .into_iter()
+            .map(|(x, y, z)| DVec3::new(f64::from(x), f64::from(y), f64::from(z)))
+            .collect();
+        if is_fine {
+            points.extend(fine.into_iter().map(|(x, y, z)| DVec3::new(x, y, z)));
+        }
+        let cells = |d: &Delaunay| {
+            let mut all: Vec<Vec<[u64; 3]>> = d.cells.iter().map(|c| {
+                let mut corners: Vec<[u64; 3]> = c.iter()
+                    .map(|v| d.points.get(*v as usize).map_or([0; 3], |p| p.to_array().map(f64::to_bits)))
+                    .collect();
+                corners.sort_unstable();
+                corners
+            }).collect();
+            all.sort_unstable();
+            all
+        };
+        let Ok(delaunay) = Delaunay::new(&points) else { return Ok(()) };
+        prop_assert_eq!(check_delaunay(&delaunay), Ok(()));
+        points.reverse();
+        let other = Delaunay::new(&points).expect("the same points");
+        prop_assert_eq!(cells(&delaunay), cells(&other));
+    }
+}
+
+#[test]
+fn the_checker_finds_what_is_wrong() {
+    let good = triangulated(&bodies::ellipsoid(100, DVec3::ONE).points);
+    let with = |change: &dyn Fn(&mut Delaunay)| {
+        let mut bad = good.clone();
+        change(&mut bad);
+        check_delaunay(&bad).is_err()
+    };
+    assert!(with(&|d| d.cells[3].swap(0, 1)));
+    assert!(with(&|d| d.neighbors[5].swap(1, 2)));
+    assert!(with(&|d| d.points[7] *= 1.5));
+    assert!(with(&|d| d.points.push(DVec3::ZERO)));
+}
+
+#[test]
+fn known_models_have_their_known_cells() {
+    if let Some(bunny) = data("models/stanford-bunny.obj") {
+        assert_eq!(
+            Delaunay::new(&bunny).expect("a body").finite_cells(),
+            246_215
+        );
+    }
+}
+
+#[test]
+fn bodies_are_closed_through_every_point() {
+    let made = closed("torus", &bodies::torus(60, 60).points, 1);
+    let exact = 2.0 * std::f64::consts::PI.powi(2) * 10.0 * 16.0;
+    // Chords of 60 around: the volume of the inscribed body is below by 0.2 to 0.6 percent.
+    assert!(
+        (0.99 * exact..exact).contains(&volume(&made)),
+        "{} of {exact}",
+        volume(&made)
+    );
+    let made = closed(
+        "ellipsoid",
+        &bodies::ellipsoid(9_950, DVec3::new(1.0, 2.0, 4.0)).points,
+        0,
+    );
+    let exact = 4.0 / 3.0 * std::f64::consts::PI * 8.0;
+    assert!((0.998 * exact..exact).contains(&volume(&made)));
+    closed(
+        "three holes",
+        &bodies::three_holes().even(4_000, 500).points,
+        3,
+    );
+    closed(
+        "cube with hole",
+        &solids::cube_with_hole(10.0).even(2_224, 280).points,
+        1,
+    );
+}
+
+#[test]
+fn faces_of_a_cube_are_flat_and_its_edges_sharp() {
+    let sampled = solids::cube(10.0).even(4_000, 360);
+    let made = closed("cube", &sampled.points, 0);
+    // Points on the edges do not hit the corners: what is missing are the corners beyond them.
+    assert!(
+        (999.5..=1000.0).contains(&volume(&made)),
+        "{}",
+        volume(&made)
+    );
+    let off = made.triangles.iter().filter(|t| {
+        let [a, b, c] = t.map(|v| made.positions[v as usize]);
+        let n = (b - a).cross(c - a).normalize_or_zero().abs();
+        n.max_element() < 1.0 - 1e-9
+    });
+    // Only at the eight corners can a triangle lie on no face.
+    assert!(off.count() <= 3 * 8);
+}
+
+#[test]
+fn noise_and_random_samples_are_closed_too() {
+    closed("block", &solids::block().sample(20_000, 0.1, 1).points, 2);
+    let clean = solids::cube_with_hole(10.0).even(6_000, 500);
+    // Table 2 of Weber's thesis: noise in percent of R = 8.5 at a spacing of 0.25.
+    for percent in [0.4, 0.8, 1.2] {
+        let reach = percent / 100.0 * 8.5 / 0.25 * clean.spacing;
+        closed(
+            &format!("{percent} %"),
+            &clean.clone().shaken(reach, 5).points,
+            1,
+        );
+    }
+}
+
+#[test]
+fn the_mesh_depends_neither_on_threads_nor_on_the_order_of_points() {
+    let points = solids::block().sample(8_000, 0.1, 4).points;
+    let with = |threads: usize| {
+        let pool = rayon_pool(threads);
+        pool.install(|| {
+            mesh(&points, Settings::default())
+                .expect("a body")
+                .triangles
+        })
+    };
+    let one = with(1);
+    assert_eq!(one, with(2));
+    let reversed: Vec<DVec3> = points.iter().rev().copied().collect();
+    let last = points.len() as u32 - 1;
+    let mut back: Vec<[u32; 3]> = (mesh(&reversed, Settings::default())
+        .expect("a body")
+        .triangles
+        .iter())
+    .map(|t| {
+        let mut t = t.map(|v| last - v);
+        let low = (0..3).min_by_key(|k| t[*k]).unwrap_or(0);
+        t.rotate_left(low);
+        t
+    })
+    .collect();
+    back.sort_unstable();
+    assert_eq!(one, back);
+}
+
+fn rayon_pool(threads: usize) -> rayon::ThreadPool {
+    rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .expect("threads")
+}
+
+#[test]
+fn open_scans_keep_their_borders() {
+    let sampled = solids::wedge(20.0, 2.0).sample(5_000, 0.05, 3);
+    let settings = Settings {
+        open: true,
+        ..Settings::default()
+    };
+    let made = mesh(&sampled.points, settings).expect("a body");
+    let t = made.topology;
+    assert!(
+        t.is_manifold() && !t.is_watertight() && t.open_edges > 50,
+        "{t:?}"
+    );
+    // Two squares of 20; the outermost points lie up to a spacing inside the border, noise roughens.
+    let share = area(&made) / 800.0;
+    assert!((0.9..1.1).contains(&share), "{share} of the area");
+    let longest = (made.triangles.iter())
+        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
+        .map(|(a, b)| made.positions[a as usize].distance(made.positions[b as usize]))
+        .fold(0.0, f64::max);
+    assert!(longest < 8.0 * sampled.spacing, "{longest} bridges");
+}
+
+#[test]
+fn normals_of_smooth_bodies_are_nearer_than_those_of_planes_and_look_out() {
+    // The author's means and deviations (Ma 2011, table 4.1).
+    let torus = (bodies::torus(60, 60), [0.00105, 0.00120, 0.00058]);
+    let axes = DVec3::new(1.0, 2.0, 4.0);
+    for (known, author) in [
+        torus,
+        (bodies::ellipsoid(9_950, axes), [0.00126, 0.00176, 0.00174]),
+    ] {
+        let cloud = cloud(&known.points);
+        let neighbors = Neighbors::new(&cloud.positions);
+        let body = Body::new(&cloud.positions, Settings::default()).expect("a body");
+        let found = normals(&body, &cloud, &neighbors, Rings::One);
+        assert_eq!(found.by_plane, 0);
+        let inward = found
+            .normals
+            .iter()
+            .zip(&known.normals)
+            .filter(|(n, t)| n.as_dvec3().dot(**t) < 0.9);
+        assert_eq!(inward.count(), 0);
+        let ours = bodies::errors(&found.normals, &known.normals);
+        let better = ours.iter().zip(&author).all(|(own, his)| own < his);
+        assert!(better, "{ours:?} against the author's {author:?}");
+        let [mean, ..] = ours;
+        for mut other in [
+            plane_normals(&cloud.positions, &neighbors, 30),
+            weighted_plane_normals(&cloud.positions, &neighbors, 40),
+        ] {
+            let [plane, ..] = bodies::errors(&other, &known.normals);
+            assert!(mean < 0.5 * plane, "{mean} against {plane}");
+            orient_normals(&cloud.positions, &neighbors, &mut other);
+            let inward = other
+                .iter()
+                .zip(&known.normals)
+                .filter(|(n, t)| n.as_dvec3().dot(**t) < 0.0);
+            assert_eq!(inward.count(), 0, "propagated over the graph of neighbours");
+        }
+    }
+}
+
+#[test]
+fn noise_chooses_two_rings() {
+    let clean = bodies::torus(100, 100);
+    for (reach, expected) in [(0.0, Rings::One), (0.1, Rings::Two)] {
+        let cloud = cloud(&bodies::shaken(&clean.points, reach, 7));
+        let neighbors = Neighbors::new(&cloud.positions);
+        let body = Body::new(&cloud.positions, Settings::default()).expect("a body");
+        let found = normals(&body, &cloud, &neighbors, Rings::Auto);
+        assert_eq!(found.rings, expected, "noise {reach} mm");
+        let other = if expected == Rings::One {
+            Rings::Two
+        } else {
+            Rings::One
+        };
+        let error = |rings| {
+            bodies::errors(
+                &normals(&body, &cloud, &neighbors, rings).normals,
+                &clean.normals,
+            )[0]
+        };
+        assert!(error(expected) < error(other), "noise {reach} mm");
+    }
+}
+
+#[test]
+fn sharp_edges_of_the_fandisk_are_edges_of_the_mesh() {
+    let Some(points) = data("models/fandisk.obj") else {
+        return;
+    };
+    let made = mesh(&points, Settings::default()).expect("a body");
+    assert!(made.topology.is_watertight() && made.topology.is_manifold());
+    assert_eq!(made.matched_percent(), 100.0);
+    let sharp = clouds::fandisk::sharp_edges(25.0);
+    let edges: std::collections::HashSet<(u32, u32)> = (made.triangles.iter())
+        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
+        .map(|(a, b)| (a.min(b), a.max(b)))
+        .collect();
+    let found = sharp.iter().filter(|e| edges.contains(e)).count();
+    assert!(
+        found as f64 >= 0.995 * sharp.len() as f64,
+        "{found} of {}",
+        sharp.len()
+    );
+}
+
+fn acies(arguments: &[&str]) -> (i32, String, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_acies"))
+        .args(arguments)
+        .output()
+        .expect("the program runs");
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (
+        output.status.code().unwrap_or(-1),
+        text(&output.stdout),
+        text(&output.stderr),
+    )
+}
+
+#[test]
+fn the_program_meshes_writes_and_refuses() {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("mesh");
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let at = |name: &str| folder.join(name).display().to_string();
+    let points = solids::cube_with_hole(10.0).even(1_500, 200).points;
+    let lines: Vec<String> = points
+        .iter()
+        .map(|p| format!("{} {} {}", p.x, p.y, p.z))
+        .collect();
+    std::fs::write(at("scan.xyz"), lines.join("\n")).expect("a scan");
+    for ending in ["ply", "stl", "obj"] {
+        let out = at(&format!("mesh.{ending}"));
+        let (status, json, wrong) = acies(&["mesh", &at("scan.xyz"), "-o", &out, "--json"]);
+        assert_eq!(status, 0, "{wrong}");
+        let said: serde_json::Value = serde_json::from_str(&json).expect("one JSON object");
+        assert_eq!(
+            (said["vertices"].as_u64(), said["triangles"].as_u64()),
+            (Some(1_500), Some(3_000))
+        );
+        assert_eq!(
+            (said["watertight"].as_bool(), said["manifold"].as_bool()),
+            (Some(true), Some(true))
+        );
+        assert_eq!(
+            (said["genus"].as_i64(), said["delta_f"].as_u64()),
+            (Some(1), Some(0))
+        );
+        assert_eq!(said["matched_percent"].as_f64(), Some(100.0));
+        assert!(said["seconds"]["delaunay"].as_f64().is_some());
+        let back = read(Path::new(&out), Unit::Millimetre)
+            .expect("its own file")
+            .cloud
+            .positions;
+        assert!(back.len() >= 1_500, "{ending}: {} points", back.len());
+    }
+    let (status, said, _) = acies(&["mesh", &at("scan.xyz")]);
+    assert_eq!(status, 0);
+    assert!(
+        said.starts_with(
+            "1500 vertices, 3000 triangles in 1 pieces: watertight, manifold, 100.00 % matched"
+        ),
+        "{said}"
+    );
+
+    let (status, json, wrong) = acies(&[
+        "normals",
+        &at("scan.xyz"),
+        "-o",
+        &at("normals.ply"),
+        "--json",
+    ]);
+    assert_eq!(status, 0, "{wrong}");
+    let said: serde_json::Value = serde_json::from_str(&json).expect("one JSON object");
+    assert_eq!(
+        (said["points"].as_u64(), said["without"].as_u64()),
+        (Some(1_500), Some(0))
+    );
+    for method in ["plane", "weighted-plane"] {
+        assert_eq!(
+            acies(&["normals", &at("scan.xyz"), "--method", method]).0,
+            0
+        );
+    }
+
+    std::fs::write(at("flat.xyz"), "0 0 0\n1 0 0\n0 1 0\n1 1 0\n3 1 0\n").expect("a scan");
+    for command in ["mesh", "normals"] {
+        let (status, _, wrong) = acies(&[command, &at("flat.xyz")]);
+        assert_eq!(status, 65);
+        assert!(
+            wrong.contains("flat.xyz: points: 5 distinct ones, all in one plane"),
+            "{wrong}"
+        );
+        let (status, _, wrong) = acies(&[command, &at("scan.xyz"), "-o", &at("mesh.doc")]);
+        assert_eq!(status, 64, "{wrong}");
+        assert_eq!(acies(&[command, &at("absent.xyz")]).0, 74);
+    }
+    assert_eq!(topology(0, &[]).vertices, 0);
+}
