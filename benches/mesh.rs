@@ -432,7 +432,7 @@ fn sharp() {
     println!(
         "\nsharp edges of the model that are edges of the mesh; aim 99.5 % with the cone filter and the exchange of diagonals"
     );
-    let mut rows: Vec<(&str, Vec<DVec3>, Vec<(u32, u32)>)> = Vec::new();
+    let mut rows: Vec<(&str, Vec<DVec3>, Links)> = Vec::new();
     if let Some((points, _)) = clouds::fandisk::model() {
         rows.push((
             "fandisk, 25 degrees",
@@ -464,8 +464,11 @@ fn sharp() {
     }
 }
 
+/// Pairs of vertices, the lower first.
+type Links = Vec<(u32, u32)>;
+
 /// Points and sharp edges of a Hoppe mesh file, or none where the data folder is absent.
-fn labelled(name: &str) -> Option<(Vec<DVec3>, Vec<(u32, u32)>)> {
+fn labelled(name: &str) -> Option<(Vec<DVec3>, Links)> {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../shared/data/sharp-labels")
         .join(name);

@@ -31,8 +31,8 @@ const LEVELS: [usize; 3] = [40, 100, 220];
 /// spacings' radius leaves of it there (0.012).
 const MODEL_ERROR: f64 = 0.018;
 /// A point is marked when the edge passes within this many spacings, less the standard deviation of its place: the spacing itself is known
-/// to three percent.
-pub(super) const THIN: f64 = 0.97;
+/// to some four percent, and what lies a whole one away in a regular grid is the next row.
+pub(super) const THIN: f64 = 0.93;
 /// Farthest tip of a cone, in spacings, of which a place bears witness.
 const TIP_REACH: f64 = 4.0;
 /// Largest turn, rad (20 degrees), of a crease that may be but the first step of a curved surface.
