@@ -147,8 +147,8 @@ pub(crate) fn widest_gap(angles: &mut [f64]) -> f64 {
 /// From residuals of local quadric fits, corrected for degrees of freedom; a low quantile over many places, so that edges, outliers and
 /// small radii do not raise it.
 pub fn noise_mm(cloud: &PointCloud, neighbors: &Neighbors, spacing: &Spacing) -> f64 {
-    const QUANTILE: f64 = 0.35;
-    const NORMAL_QUANTILE: f64 = -0.385;
+    const QUANTILE: f64 = 0.15;
+    const NORMAL_QUANTILE: f64 = -1.036;
     let ratio = (spacing.across_mm / spacing.along_mm.max(f64::MIN_POSITIVE)).clamp(1.0, 20.0);
     let k = (32.0 * (ratio / 1.5).max(1.0)) as usize;
     let variances: Vec<(f64, f64)> = sample(neighbors.places())
