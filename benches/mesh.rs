@@ -22,6 +22,9 @@ mod clouds;
 use clouds::score::cloud;
 use clouds::{Line, Random, solids};
 
+/// Pairs of points, the lower index first.
+type Edges = Vec<(u32, u32)>;
+
 /// A file of the data folder, or none, said aloud.
 fn data(name: &str) -> Option<Vec<DVec3>> {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
@@ -432,18 +435,17 @@ fn sharp() {
     println!(
         "\nsharp edges of the model that are edges of the mesh; aim 99.5 % with the cone filter and the exchange of diagonals"
     );
-    let mut rows: Vec<(&str, Vec<DVec3>, Links)> = Vec::new();
+    let mut rows: Vec<(&str, (Vec<DVec3>, Edges))> = Vec::new();
     if let Some((points, _)) = clouds::fandisk::model() {
         rows.push((
             "fandisk, 25 degrees",
-            points,
-            clouds::fandisk::sharp_edges(25.0),
+            (points, clouds::fandisk::sharp_edges(25.0)),
         ));
     }
     for name in ["mechpart.recon.m", "standingblob.orig.m"] {
-        rows.extend(labelled(name).map(|(points, edges)| (name, points, edges)));
+        rows.extend(labelled(name).map(|found| (name, found)));
     }
-    for (name, points, edges) in rows {
+    for (name, (points, edges)) in rows {
         for cone in [false, true] {
             let made = mesh(&points, Settings { cone, open: false }).expect("a body");
             let has: HashSet<(u32, u32)> = (made.triangles.iter())
@@ -464,11 +466,8 @@ fn sharp() {
     }
 }
 
-/// Pairs of vertices, the lower first.
-type Links = Vec<(u32, u32)>;
-
 /// Points and sharp edges of a Hoppe mesh file, or none where the data folder is absent.
-fn labelled(name: &str) -> Option<(Vec<DVec3>, Links)> {
+fn labelled(name: &str) -> Option<(Vec<DVec3>, Edges)> {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
         .join("../shared/data/sharp-labels")
         .join(name);

@@ -291,8 +291,9 @@ fn faces_of_a_cube_are_flat_and_its_edges_sharp() {
         let n = (b - a).cross(c - a).normalize_or_zero().abs();
         n.max_element() < 1.0 - 1e-9
     });
-    // Only at the eight corners can a triangle lie on no face.
-    assert!(off.count() <= 3 * 8);
+    // At the eight corners, and where a point of a face lies too near an edge for its link to be Delaunay, a triangle lies on no face.
+    let off = off.count();
+    assert!(off <= 3 * 8, "{off} triangles off the faces");
 }
 
 #[test]

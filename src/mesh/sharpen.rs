@@ -16,9 +16,6 @@ const MOST_ROUNDS: usize = 8;
 /// A change gains at least this share of the bends it touches: less is rounding.
 const LEAST_GAIN: f64 = 1e-6;
 
-/// Angle, rad, below which a surface turns smoothly: there the Delaunay triangulation has the better triangles.
-const SMOOTH: f64 = 0.2;
-
 /// Exchanges diagonals until none gains; the number exchanged.
 pub fn sharpen(delaunay: &Delaunay, stars: &Stars, inside: &mut [bool]) -> usize {
     let mut ring = Ring::default();
@@ -130,14 +127,14 @@ impl Quad {
     }
 }
 
-/// Length of the edge from `a` to `b` times the square root of the angle, rad, by which the surface turns sharply there between its triangles with `c` and `d`.
+/// Length of the edge from `a` to `b` times the square root of the angle, rad, by which the surface turns there between its triangles with `c` and `d`.
 ///
 /// The root makes one sharp edge cheaper than two half as sharp.
 fn bend(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> f64 {
     let along = b - a;
     let (m, n) = (along.cross(c - a), (-along).cross(d - b));
     let angle = m.cross(n).length().atan2(m.dot(n));
-    along.length() * (angle - SMOOTH).max(0.0).sqrt()
+    along.length() * angle.sqrt()
 }
 
 /// The third corner of the other surface triangle at edge `a` `b` of the surface facet opposite corner `at` of `cell`, whose third corner is `third`.
@@ -179,8 +176,8 @@ mod tests {
         let c = DVec3::new(1.0, 1.0, 0.0);
         assert_eq!(bend(a, b, c, DVec3::new(0.3, -2.0, 0.0)), 0.0);
         let right = bend(a, b, c, DVec3::new(1.0, 0.0, -1.0));
-        assert!((right - 2.0 * (std::f64::consts::FRAC_PI_2 - SMOOTH).sqrt()).abs() < 1e-12);
+        assert!((right - 2.0 * std::f64::consts::FRAC_PI_2.sqrt()).abs() < 1e-12);
         let folded = bend(a, b, c, DVec3::new(1.0, 3.0, 0.0));
-        assert!((folded - 2.0 * (std::f64::consts::PI - SMOOTH).sqrt()).abs() < 1e-12);
+        assert!((folded - 2.0 * std::f64::consts::PI.sqrt()).abs() < 1e-12);
     }
 }

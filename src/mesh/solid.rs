@@ -3,7 +3,7 @@
 //! We differ: where umbrellas do not match, the thesis leaves holes (Ma 2011, §3.4). Here every umbrella says which of the cells around its
 //! vertex lie on its two sides; neighbours are brought to one sense; every cell takes the side that its four corners say it is on.
 //! The facets between inside and outside are closed whatever the cells say, never cross one another, and agree with all umbrellas that
-//! match. What is left to mend are vertices around which inside and outside are not one piece each, and [`super::mend`] turns cells until there are none.
+//! match. What is left to mend are vertices around which inside and outside are not one piece each, and [`super::mend::mend`] turns cells until there are none.
 
 use std::collections::HashMap;
 
