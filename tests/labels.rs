@@ -121,7 +121,6 @@ fn figures(name: &str, model: &Labelled) -> Figures {
     let cloud = PointCloud::from_positions(Frame::Part, model.vertices.clone());
     let neighbors = Neighbors::new(&cloud.positions);
     let detection = detect(&cloud, &neighbors, Method::Adaptive);
-    println!("{:?} noise {}", detection.spacing, detection.noise_mm);
     let spacing = detection.spacing.mean_mm;
     let on_edge = |class: &Class| matches!(class, Class::Edge | Class::Corner);
     let found: Vec<DVec3> = (cloud.positions.iter().zip(&detection.classes))
@@ -282,7 +281,6 @@ fn an_abc_model_by_its_feature_file() {
     let samples = area_samples(&fs::read(&stl).expect("a readable model"), 40_000);
     let cloud = PointCloud::from_positions(Frame::Part, samples);
     let detection = detect(&cloud, &Neighbors::new(&cloud.positions), Method::Adaptive);
-    println!("{:?} noise {}", detection.spacing, detection.noise_mm);
     let spacing = detection.spacing.mean_mm;
     // A circle of less than five spacings is no edge in samples of this spacing.
     let circles = sharp_circles(&fs::read_to_string(yml).expect("a readable feature file"));

@@ -1,5 +1,6 @@
 //! Pictures of meshes, to be looked at: flat shaded triangles, nearer ones in front, no perspective. The same mesh gives the same bytes.
 
+use crate::points::picture::encode;
 use glam::{DMat3, DVec3};
 
 /// The bytes of a PNG picture of `triangles` over `positions`, looked at along `sight`, with z upwards where that is possible.
@@ -106,18 +107,4 @@ impl Canvas {
             }
         }
     }
-}
-
-fn encode(pixels: &[u8], width: u32, height: u32) -> Vec<u8> {
-    let mut bytes = Vec::new();
-    let mut encoder = png::Encoder::new(&mut bytes, width, height);
-    encoder.set_color(png::ColorType::Rgb);
-    encoder.set_depth(png::BitDepth::Eight);
-    let written = encoder.write_header().and_then(|mut writer| {
-        writer.write_image_data(pixels)?;
-        writer.finish()
-    });
-    // The sides are not zero, the pixels as many as they say, and memory takes what is written.
-    written.expect("a sound picture is encoded to memory");
-    bytes
 }

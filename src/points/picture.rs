@@ -242,7 +242,8 @@ fn span(centre: f64, radius: f64, length: usize) -> std::ops::Range<usize> {
     first.min(length)..end.min(length)
 }
 
-fn encode(pixels: &[u8], width: u32, height: u32) -> Vec<u8> {
+/// The picture of `pixels` (red, green, blue; row by row) as PNG.
+pub(crate) fn encode(pixels: &[u8], width: u32, height: u32) -> Vec<u8> {
     let mut bytes = Vec::new();
     let mut encoder = png::Encoder::new(&mut bytes, width, height);
     encoder.set_color(png::ColorType::Rgb);

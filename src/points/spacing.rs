@@ -42,8 +42,8 @@ impl Spacing {
 
 /// The spacing of `cloud`; all zero where it has fewer than three distinct points.
 ///
-/// From the lattice where there is one; else medians over a sample of places. Across the lines counts the radius within which a place has neighbours in every direction of
-/// its tangent plane; that holds for lattices, merged views and unorganised points alike.
+/// From the lattice where there is one; else medians over a sample of places, where across the lines counts the radius within which a
+/// place has neighbours in every direction of its tangent plane; that holds for merged views and unorganised points alike.
 pub fn spacing(cloud: &PointCloud, neighbors: &Neighbors) -> Spacing {
     let samples: Vec<[f64; 3]> = sample(neighbors.places())
         .par_iter()
