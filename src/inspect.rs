@@ -207,6 +207,7 @@ fn judged(edge: &BodyEdge, measured: MeasuredEdge, recipe: &Recipe) -> EdgeResul
         length_mm: edge.length_mm,
         coverage,
         stations,
+        breaks: measured.breaks,
         mean: measured.mean,
         verdict,
     }

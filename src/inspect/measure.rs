@@ -7,7 +7,7 @@ use super::assign::{Place, Surface};
 use super::body::{Body, BodyEdge};
 use super::collect::{self, Scene, Track};
 use super::flank::{FlankFit, FlankGap, FlankSeries, FlankSettings, Windows, measure_flank};
-use super::result::{EdgeMean, Measured};
+use super::result::{Budget, EdgeBreak, EdgeMean, Measured};
 use super::virtual_edge::{VirtualEdge, intersect};
 use crate::nominal::Station;
 use crate::points::PointCloud;
@@ -45,6 +45,8 @@ pub struct MeasureSettings {
 pub struct MeasuredEdge {
     /// Every station with what was measured or why not.
     pub stations: Vec<MeasuredStation>,
+    /// The shape of the edge itself, one a stretch.
+    pub breaks: Vec<EdgeBreak>,
     /// Mean of d1 and d2 over the measured stations and their standard uncertainties, mm; `None` where none was measured.
     pub mean: Option<EdgeMean>,
     /// What was peculiar, for the findings.
@@ -226,6 +228,7 @@ impl<B: Body> EdgeContext<'_, B> {
         }
         MeasuredEdge {
             stations,
+            breaks: Vec::new(),
             mean: self.mean(&sum, series),
             remarks: self.remarks(series),
         }
@@ -252,15 +255,28 @@ impl<B: Body> EdgeContext<'_, B> {
             let row = pose_row(edge.point, station.normals[i]);
             quadratic(&row, &self.settings.pose_covariance, &row)
         });
-        let calibration = self.settings.u_calibration_mm.powi(2);
+        let budget_d = [0, 1].map(|i| Budget {
+            points: edge.covariance[i][i].sqrt(),
+            alignment: pose[i].max(0.0).sqrt(),
+            calibration: self.settings.u_calibration_mm,
+            temperature: 0.0,
+        });
+        // A rigid motion changes no angle.
+        let budget_angle = Budget {
+            points: edge.covariance[2][2].sqrt(),
+            alignment: 0.0,
+            calibration: self.settings.u_calibration_rad,
+            temperature: 0.0,
+        };
         Measured {
             point: edge.point,
             d_mm: edge.d_mm,
-            u_d_mm: [0, 1].map(|i| (edge.covariance[i][i] + pose[i] + calibration).sqrt()),
+            u_d_mm: budget_d.map(|budget| budget.u()),
             included_angle_rad: edge.included_angle_rad,
-            u_included_angle_rad: (edge.covariance[2][2] + self.settings.u_calibration_rad.powi(2))
-                .sqrt(),
+            u_included_angle_rad: budget_angle.u(),
             residual_mm: flanks.map(|f| f.sigma_mm),
+            budget_d,
+            budget_angle,
         }
     }
 

@@ -84,6 +84,8 @@ pub struct EdgeResult {
     pub coverage: f64,
     /// In order of arc length.
     pub stations: Vec<StationResult>,
+    /// The shape of the edge itself, one a stretch of stations, in order of arc length; empty where it was not seen.
+    pub breaks: Vec<EdgeBreak>,
     /// Mean deviations over the measured stations; `None` where none was measured.
     pub mean: Option<EdgeMean>,
     /// Worst of the stations against the limits of the recipe.
@@ -129,4 +131,89 @@ pub struct Measured {
     pub u_included_angle_rad: f64,
     /// Residual standard deviation of each flank fit, mm.
     pub residual_mm: [f64; 2],
+    /// What `u_d_mm` is made of.
+    pub budget_d: [Budget; 2],
+    /// What `u_included_angle_rad` is made of.
+    pub budget_angle: Budget,
+}
+
+/// A value with its standard uncertainty, both in the unit of the field's name.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Quantified {
+    /// The value.
+    pub value: f64,
+    /// Its standard uncertainty, all contributions.
+    pub u: f64,
+}
+
+/// What a standard uncertainty is made of: its independent contributions, in the unit of the value.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Budget {
+    /// The points: noise, correlated noise and lack of fit of the flanks.
+    pub points: f64,
+    /// The alignment: the same error of pose for all values of a part.
+    pub alignment: f64,
+    /// The calibration of the sensors: the same error for all parts.
+    pub calibration: f64,
+    /// Temperature: the uncertainty of the part's expansion.
+    pub temperature: f64,
+}
+
+impl Budget {
+    /// The standard uncertainty: root of the sum of squares (JCGM 100, 5.1.2).
+    pub fn u(&self) -> f64 {
+        let parts = [
+            self.points,
+            self.alignment,
+            self.calibration,
+            self.temperature,
+        ];
+        parts.iter().map(|u| u * u).sum::<f64>().sqrt()
+    }
+}
+
+/// The real edge against the ideal sharp one, over a stretch of stations: what lies between the two flanks.
+///
+/// Source: features-and-standards, section 5, characteristics 6 to 12.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EdgeBreak {
+    /// First and last arc length of the stretch, mm.
+    pub s_mm: [f64; 2],
+    /// What the shape is, with the size that belongs to it.
+    pub shape: BreakShape,
+    /// Distance from the virtual edge to the place where each flank ends, mm.
+    pub detachment_mm: [Quantified; 2],
+    /// Distance from the virtual edge to the highest place of the real profile, mm.
+    pub truncation_mm: Quantified,
+    /// Largest excess outside the ideal sharp edge, mm; 0 where none is seen above its uncertainty.
+    pub burr_mm: Quantified,
+    /// Largest depth missing inside the ideal sharp edge, along the inward normal of each face, mm: for an edge that is meant to be broken the
+    /// size of the break, in the sense of ISO 13715 an undercut where it is not.
+    pub undercut_mm: [Quantified; 2],
+    /// Points in the transition zone that were used.
+    pub points: usize,
+}
+
+/// Shape of an edge break.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum BreakShape {
+    /// No break that the data can tell from a sharp edge: a radius would have to be below this, mm, with 95 % probability.
+    Sharp {
+        /// Upper bound of the radius.
+        radius_below_mm: f64,
+    },
+    /// A cylinder tangent to both flanks.
+    Round {
+        /// Its radius, mm.
+        radius_mm: Quantified,
+    },
+    /// A plane that cuts both flanks.
+    Chamfer {
+        /// Distances from the virtual edge along flank 1 and 2, mm.
+        legs_mm: [Quantified; 2],
+        /// Angle of the chamfer's plane to flank 1, rad.
+        angle_rad: Quantified,
+    },
+    /// Neither: a burr, an undercut, damage.
+    Irregular,
 }

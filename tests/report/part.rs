@@ -5,7 +5,9 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use acies::geometry::RigidTransform;
 use acies::inspect::recipe::{Limits, Recipe, Rule};
-use acies::inspect::result::{Alignment, EdgeResult, Inspection, Measured, StationResult, Verdict};
+use acies::inspect::result::{
+    Alignment, Budget, EdgeResult, Inspection, Measured, StationResult, Verdict,
+};
 use acies::nominal::{EdgeKind, Station};
 use acies::report::{DeviceFacts, Facts, ScanFacts};
 use acies_drivers::device::{Identity, Losses};
@@ -162,6 +164,14 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
             included_angle_rad: nominal_angle + 0.0015 * noise(seed),
             u_included_angle_rad: 0.0015,
             residual_mm: [0.019, 0.021],
+            budget_d: u_mm.map(|u| Budget {
+                points: u,
+                ..Budget::default()
+            }),
+            budget_angle: Budget {
+                points: 0.0015,
+                ..Budget::default()
+            },
         }),
         points: [184, 172],
         verdict,
@@ -184,6 +194,7 @@ fn edge(index: usize, shape: &Shape, stations: usize, seed: &mut u64) -> EdgeRes
         kind: shape.kind,
         length_mm: shape.length_mm,
         coverage: measured as f64 / stations.len() as f64,
+        breaks: Vec::new(),
         mean: None,
         verdict: stations
             .iter()
