@@ -6,17 +6,24 @@
 pub mod align;
 pub mod assign;
 pub mod body;
+pub mod characteristic;
 mod clusters;
 mod collect;
 pub mod compare;
+pub mod corner;
 pub mod flank;
+pub mod form;
+pub mod gap;
 pub mod measure;
+pub mod quantity;
 pub mod recipe;
 pub mod result;
 pub mod verdict;
 pub mod virtual_edge;
 
 use std::time::Instant;
+
+use glam::DVec3;
 
 pub use align::{AlignOptions, Start, Touch};
 pub use body::Body;
@@ -26,8 +33,13 @@ pub use result::Inspection;
 use align::{Aligned, Scan, align};
 use assign::Surface;
 use body::BodyEdge;
+use characteristic::{EdgeValues, at_station, characteristics};
+use corner::CornerSettings;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges};
-use result::{EdgeResult, ScanEstimate, StationResult, Verdict};
+use quantity::Quantity;
+use recipe::{EdgeFacts, EdgeKey, Resolved};
+use result::{EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
+use verdict::judge;
 
 use crate::features::{self, Method};
 use crate::points::{Frame, Neighbors, PointCloud, noise_mm, spacing};
@@ -41,6 +53,8 @@ pub struct Request<'a> {
     pub recipe: &'a Recipe,
     /// What is known of the pose.
     pub start: Start,
+    /// Temperature of the part, degrees Celsius; `None` = nobody says.
+    pub temperature_c: Option<f64>,
     /// Contacts of a probe with the part, in the frame of the scan.
     pub touches: &'a [Touch],
     /// Told the name of every stage as it begins.
@@ -53,6 +67,7 @@ impl<'a> Request<'a> {
         Self {
             recipe,
             start,
+            temperature_c: None,
             touches: &[],
             progress: &|_| {},
         }
@@ -106,19 +121,47 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let edges = nominal.edges();
     let compared = compare::compare(&part, &detection, nominal, (&edges, &measured));
 
+    let facts = all_edge_facts(nominal);
+    let resolved = resolve(&facts, request.recipe, &mut findings);
     let results: Vec<EdgeResult> = edges
         .iter()
         .zip(measured)
-        .map(|(edge, measured)| {
+        .zip(&resolved)
+        .map(|((edge, measured), asked)| {
             findings.extend(measured.remarks.iter().cloned());
-            judged(edge, measured, request.recipe)
+            judged(edge, measured, asked, request.recipe)
         })
         .collect();
-    report_unknown_edges(&edges, request.recipe, &mut findings);
-    let verdict = verdict::judge_part(results.iter().map(|e| e.verdict), alignment.status);
+    let corners = corner::measure(
+        nominal,
+        &corner::corners(nominal, &edges),
+        (&edges, &results),
+        &CornerSettings {
+            limit_mm: request.recipe.corner_mm,
+            rule: request.recipe.rule,
+            pose_covariance: &alignment.covariance,
+            u_calibration_mm: request.recipe.u_calibration_mm,
+        },
+    );
+    let gaps = gaps(&edges, &results, request.recipe, &mut findings);
+    let values = results
+        .iter()
+        .map(|e| e.verdict)
+        .chain(corners.iter().map(|c| c.verdict))
+        .chain(gaps.iter().map(|g| g.verdict))
+        .chain(compared_verdict(
+            &compared,
+            &resolved,
+            &edges,
+            request.recipe,
+        ))
+        .chain(environment_verdict(request, &mut findings));
+    let verdict = verdict::judge_part(values, alignment.status);
     Inspection {
         alignment,
         edges: results,
+        corners,
+        gaps,
         unexpected_edges: compared.unexpected,
         missing_edges: compared.missing,
         verdict,
@@ -130,6 +173,113 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
             classes: detection.classes,
         }),
     }
+}
+
+/// What every sharp edge of `nominal` is selected by.
+pub fn all_edge_facts<B: Body>(nominal: &B) -> Vec<EdgeFacts> {
+    let edges = nominal.edges();
+    (0..edges.len())
+        .map(|e| edge_facts(nominal, e, &edges[e]))
+        .collect()
+}
+
+/// Seventeen places along it show its box and its angles: nominal edges of parts are smoother than that.
+fn edge_facts<B: Body>(nominal: &B, index: usize, edge: &BodyEdge) -> EdgeFacts {
+    let stations = (0..=16).map(|k| nominal.station(index, edge.length_mm * f64::from(k) / 16.0));
+    let mut facts = EdgeFacts {
+        id: edge.id.clone(),
+        entity: edge.entity,
+        faces: edge.faces.map(|face| nominal.face_entity(face)),
+        kind: edge.kind,
+        box_mm: [DVec3::INFINITY, DVec3::NEG_INFINITY],
+        turn_angle_rad: [f64::INFINITY, 0.0],
+    };
+    for station in stations {
+        let turn = station.normals[0].angle_between(station.normals[1]);
+        let [low, high] = facts.box_mm;
+        facts.box_mm = [low.min(station.point), high.max(station.point)];
+        let [least, most] = facts.turn_angle_rad;
+        facts.turn_angle_rad = [least.min(turn), most.max(turn)];
+    }
+    facts
+}
+
+/// What the recipe says of every edge; an entry that means none becomes a finding, a name for several gets their ids behind it.
+fn resolve(facts: &[EdgeFacts], recipe: &Recipe, findings: &mut Vec<String>) -> Vec<Resolved> {
+    for entry in &recipe.edges {
+        if !facts.iter().any(|edge| entry.select.means(edge)) {
+            findings.push(format!(
+                "recipe: edge: {} is no sharp edge of the nominal, expected its entity or id; the entry is left out",
+                entry.select.words()
+            ));
+        }
+    }
+    let mut resolved: Vec<Resolved> = facts.iter().map(|edge| recipe.of(edge)).collect();
+    let names: Vec<Option<String>> = resolved.iter().map(|edge| edge.name.clone()).collect();
+    for (edge, facts) in resolved.iter_mut().zip(facts) {
+        let shared = names.iter().filter(|name| **name == edge.name).count() > 1;
+        if let Some(name) = edge.name.as_mut().filter(|_| shared) {
+            *name = format!("{name} {}", facts.id);
+        }
+    }
+    resolved
+}
+
+/// Missing edges count where they have limits, unexpected ones where the recipe says so.
+fn compared_verdict(
+    compared: &compare::Compared,
+    resolved: &[Resolved],
+    edges: &[BodyEdge],
+    recipe: &Recipe,
+) -> Option<Verdict> {
+    let missing = edges
+        .iter()
+        .zip(resolved)
+        .any(|(edge, asked)| !asked.limits.is_empty() && compared.missing.contains(&edge.id));
+    let counts = (missing && recipe.missing_edges_count)
+        || (!compared.unexpected.is_empty() && recipe.unexpected_edges_count);
+    counts.then_some(Verdict::NotOk)
+}
+
+/// Nothing is decided outside the temperatures of the recipe, or where nobody knows the temperature.
+fn environment_verdict(request: &Request<'_>, findings: &mut Vec<String>) -> Option<Verdict> {
+    let [low, high] = request.recipe.temperature_c?;
+    let seen = match request.temperature_c {
+        Some(t) if (low..=high).contains(&t) => return None,
+        Some(t) => format!("{t} degrees Celsius"),
+        None => "nobody said".to_owned(),
+    };
+    findings.push(format!(
+        "temperature of the part: {seen}, expected {low} to {high} degrees Celsius; nothing is decided"
+    ));
+    Some(Verdict::NotDecidable)
+}
+
+fn gaps(
+    edges: &[BodyEdge],
+    results: &[EdgeResult],
+    recipe: &Recipe,
+    findings: &mut Vec<String>,
+) -> Vec<GapResult> {
+    let find = |key: &EdgeKey| {
+        edges.iter().position(|edge| match key {
+            EdgeKey::Entity(entity) => *entity == edge.entity,
+            EdgeKey::Id(id) => *id == edge.id,
+        })
+    };
+    let mut gaps = Vec::new();
+    for asked in &recipe.gaps {
+        match [find(&asked.edges[0]), find(&asked.edges[1])] {
+            [Some(a), Some(b)] if a != b => {
+                gaps.push(gap::measure(asked, [&results[a], &results[b]], recipe.rule));
+            }
+            _ => findings.push(format!(
+                "recipe: gap {:?}: {:?} are not two sharp edges of the nominal, expected their ids or entities; the gap is left out",
+                asked.name, asked.edges
+            )),
+        }
+    }
+    gaps
 }
 
 /// Indices of the faces with these entities; an entity that is no face becomes a finding.
@@ -147,69 +297,81 @@ fn datum_faces<B: Body>(nominal: &B, entities: &[u64], findings: &mut Vec<String
     faces
 }
 
-fn report_unknown_edges(edges: &[BodyEdge], recipe: &Recipe, findings: &mut Vec<String>) {
-    for entry in &recipe.edges {
-        let known = edges
-            .iter()
-            .any(|edge| recipe.edge(&edge.id, edge.entity) == Some(entry));
-        if !known {
-            findings.push(format!(
-                "recipe: edge: {} is no sharp edge of the nominal, expected its entity or id; the entry is left out",
-                match &entry.key {
-                    recipe::EdgeKey::Entity(entity) => format!("#{entity}"),
-                    recipe::EdgeKey::Id(id) => format!("{id:?}"),
-                }
-            ));
-        }
-    }
-}
-
-fn judged(edge: &BodyEdge, measured: MeasuredEdge, recipe: &Recipe) -> EdgeResult {
-    let limits = recipe.limits(&edge.id, edge.entity);
+fn judged(
+    edge: &BodyEdge,
+    measured: MeasuredEdge,
+    asked: &Resolved,
+    recipe: &Recipe,
+) -> EdgeResult {
     let total = measured.stations.len().max(1);
     let stations: Vec<StationResult> = measured
         .stations
         .into_iter()
         .map(|s| {
-            let (measured, verdict, reason) = match s.outcome {
-                Ok(m) => {
-                    let nominal = virtual_edge::nominal_angle(&s.station, edge.kind);
-                    let (verdict, reason) =
-                        verdict::judge_station(&m, nominal, &limits, recipe.rule);
-                    (Some(m), verdict, reason)
-                }
+            let (measured, reason) = match s.outcome {
+                Ok(measured) => (Some(measured), String::new()),
                 // The edge as a whole answers for what is missing, by its coverage.
-                Err(reason) => (None, Verdict::Undefined, reason),
+                Err(reason) => (None, reason),
             };
-            StationResult {
+            let mut station = StationResult {
                 station: s.station,
                 measured,
                 points: s.points,
-                verdict,
+                verdict: Verdict::Undefined,
                 reason,
-            }
+            };
+            judge_station(&mut station, edge, asked, recipe);
+            station
         })
         .collect();
     let coverage = stations.iter().filter(|s| s.measured.is_some()).count() as f64 / total as f64;
+    let form = form::form(&stations, recipe.direction_mm);
+    let values = EdgeValues {
+        kind: edge.kind,
+        stations: &stations,
+        breaks: &measured.breaks,
+        form: form.as_ref(),
+    };
+    let characteristics = characteristics(&values, &asked.limits, recipe.rule);
     let verdict = verdict::judge_edge(
-        stations.iter().map(|s| s.verdict),
+        characteristics.iter().map(|c| c.verdict),
         coverage,
         recipe.minimum_coverage,
-        &limits,
+        !asked.limits.is_empty(),
     );
-    let name = recipe
-        .edge(&edge.id, edge.entity)
-        .and_then(|e| e.name.clone());
     EdgeResult {
-        id: name.unwrap_or_else(|| edge.id.clone()),
+        id: asked.name.clone().unwrap_or_else(|| edge.id.clone()),
         nominal_entity: edge.entity,
         kind: edge.kind,
         length_mm: edge.length_mm,
         coverage,
         stations,
         breaks: measured.breaks,
+        form,
+        characteristics,
         mean: measured.mean,
         verdict,
+    }
+}
+
+/// The worst verdict on the values of a station, and the reason where it is `NotDecidable`.
+fn judge_station(station: &mut StationResult, edge: &BodyEdge, asked: &Resolved, recipe: &Recipe) {
+    let mut reasons = Vec::new();
+    for quantity in Quantity::all() {
+        let Some(value) = at_station(station, edge.kind, quantity) else {
+            continue;
+        };
+        let verdict = judge(value.value, value.u, asked.limits.of(quantity), recipe.rule);
+        if verdict == Verdict::NotDecidable {
+            reasons.push(format!(
+                "a limit of {} lies inside its uncertainty",
+                quantity.words()
+            ));
+        }
+        station.verdict = station.verdict.max(verdict);
+    }
+    if station.verdict == Verdict::NotDecidable {
+        station.reason = reasons.join("; ");
     }
 }
 

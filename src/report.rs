@@ -44,6 +44,8 @@ pub struct Facts {
     pub devices: Vec<DeviceFacts>,
     /// What the values were judged by.
     pub recipe: Recipe,
+    /// Whether every station says what its uncertainties are made of.
+    pub with_budgets: bool,
 }
 
 /// Size, spacing and noise of the scan, as estimated from the data.

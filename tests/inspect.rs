@@ -7,6 +7,8 @@
 
 #[path = "inspect/solids.rs"]
 mod solids;
+#[path = "inspect/whole.rs"]
+mod whole;
 
 use acies::geometry::RigidTransform;
 use acies::geometry::fit::invert_spd;

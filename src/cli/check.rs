@@ -8,7 +8,6 @@ use anyhow::anyhow;
 use super::{Failure, Status, print_line};
 use crate::cell::{self, CellError};
 use crate::config::{Cell, ConfigErrors, LocatedMistake};
-use crate::inspect::recipe::EdgeKey;
 
 /// Reads a cell's configuration, its part and its recipe, and lists every mistake with its line.
 #[derive(Debug, clap::Args)]
@@ -85,12 +84,7 @@ fn check_part(cell: &Cell) -> Result<(), Vec<LocatedMistake>> {
         )],
     })?;
     let is_face = |entity: &u64| nominal.faces.iter().any(|face| face.entity == *entity);
-    let is_edge = |key: &EdgeKey| {
-        nominal.sharp_edges.iter().any(|edge| match key {
-            EdgeKey::Entity(entity) => edge.entity == *entity,
-            EdgeKey::Id(id) => edge.id == *id,
-        })
-    };
+    let facts = crate::inspect::all_edge_facts(&nominal);
     let faces = recipe
         .datum_faces
         .iter()
@@ -106,12 +100,12 @@ fn check_part(cell: &Cell) -> Result<(), Vec<LocatedMistake>> {
     let edges = recipe
         .edges
         .iter()
-        .filter(|edge| !is_edge(&edge.key))
+        .filter(|edge| !facts.iter().any(|facts| edge.select.means(facts)))
         .map(|edge| {
             told(
                 recipe_file,
                 "edge",
-                format!("{:?}", edge.key),
+                edge.select.words(),
                 "a sharp edge of the nominal",
             )
         });

@@ -183,6 +183,7 @@ fn facts(outcome: &Outcome, seed: u64) -> Facts {
         losses: None,
     });
     Facts {
+        with_budgets: false,
         part: "acies-demo-part".to_owned(),
         nominal: "part.step".to_owned(),
         created: SystemTime::now(),

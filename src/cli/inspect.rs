@@ -36,6 +36,12 @@ pub struct Inspect {
     /// Unit of the scan: um, mm, cm, m or in. PLY, PCD and STL do not say.
     #[arg(long, default_value = "mm")]
     unit: Unit,
+    /// Temperature of the part when it was scanned, degrees Celsius. A recipe may ask for it.
+    #[arg(long, value_name = "CELSIUS", allow_negative_numbers = true)]
+    temperature: Option<f64>,
+    /// Say of every station what its uncertainties are made of.
+    #[arg(long)]
+    budget: bool,
     /// Write the report; the ending .json, .html or .csv says in which form. May be given several times.
     #[arg(short, long, value_name = "REPORT")]
     output: Vec<PathBuf>,
@@ -112,6 +118,7 @@ impl Inspect {
         };
         let request = Request {
             progress: &tell,
+            temperature_c: self.temperature,
             ..Request::new(recipe, start)
         };
         let inspection = inspect::inspect(&scan.cloud, nominal, &request);
@@ -125,6 +132,7 @@ impl Inspect {
         let estimate = inspection.scan.as_ref();
         let lines = estimate.filter(|e| e.spacing.in_lines());
         Facts {
+            with_budgets: self.budget,
             part: part_name(&self.nominal),
             nominal: file_name(&self.nominal),
             // The file's time is as near as a file can say when it was scanned.

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use glam::DVec3;
 
 use super::body::{Body, BodyEdge};
-use super::measure::MeasuredEdge;
+use super::measure::{MeasuredEdge, PARALLEL};
 use crate::features::{Class, Detection};
 use crate::points::{Neighbors, PointCloud};
 
@@ -138,7 +138,7 @@ fn length(line: &[DVec3]) -> f64 {
     line.windows(2).map(|pair| pair[0].distance(pair[1])).sum()
 }
 
-/// Edges whose flanks were both measured over most of their length, and along which nothing was found.
+/// Edges whose flanks were both seen over most of their length, and along which nothing was found.
 fn missing(
     found: &[DVec3],
     edges: &[BodyEdge],
@@ -151,9 +151,14 @@ fn missing(
     for (edge, measured) in edges.iter().zip(measured) {
         let (mut adequate, mut without) = (0.0, 0.0);
         for station in &measured.stations {
-            let Ok(m) = &station.outcome else { continue };
+            let place = match &station.outcome {
+                Ok(measured) => measured.point,
+                // Both flanks are seen, and they go on into each other.
+                Err(reason) if reason == PARALLEL => station.station.point,
+                Err(_) => continue,
+            };
             adequate += 1.0;
-            tree.nearest(m.point, 1, &mut hit);
+            tree.nearest(place, 1, &mut hit);
             without += f64::from(hit.first().is_none_or(|h| h.1 > near * near));
         }
         let enough = adequate > 0.5 * measured.stations.len() as f64;

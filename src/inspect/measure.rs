@@ -21,6 +21,9 @@ const DEPTH: f64 = 3.0;
 /// Scan lines that a station must hold: three hold a slope, one more to see its noise.
 const LINES: f64 = 4.0;
 
+/// The reason of a station where both flanks were measured and do not meet.
+pub const PARALLEL: &str = "the two flanks are parallel";
+
 /// What is known of the data, and what is asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct MeasureSettings {
@@ -217,7 +220,7 @@ impl<B: Body> EdgeContext<'_, B> {
                         sum.add(&station, &edge);
                         self.measured(&station, &edge, [first, second])
                     })
-                    .ok_or_else(|| "the two flanks are parallel".to_string()),
+                    .ok_or_else(|| PARALLEL.to_string()),
                 _ => Err(self.reason(flanks)),
             };
             stations.push(MeasuredStation {

@@ -1,101 +1,239 @@
-//! What an inspection is asked to judge: limits, decision rule, datums, calibration. As plain values, and read from TOML.
+//! What an inspection is asked to judge: limits, decision rule, datums, calibration, environment. As plain values, and read from TOML.
 //!
 //! ```toml
-//! rule = { guard_band = 2.0 }       # or "simple", the default
+//! rule = { guard_band = 2.0 }       # or "simple", the default, or { conformance = 0.95 }, in the manner of ISO 14253-1
 //! datum_faces = [17, 45, 61]        # STEP entities; without them all faces hold the alignment
 //! minimum_coverage = 0.9            # an edge measured over less is not decidable
+//! missing_edges = "not_ok"          # of edges with limits, the default; or "report"
+//! unexpected_edges = "report"       # the default; or "not_ok"
 //! station_step_mm = 1.0             # without it derived from the data
+//! flank_mm = 2.0                    # depth of the flanks; without it derived from the data
+//! direction_mm = 5.0                # length over which a direction is taken; without it five stations
 //! u_calibration_mm = 0.002          # standard uncertainty of a flank's place from the sensor's calibration
 //! u_calibration_rad = 0.0           # and of the included angle
+//!
+//! [environment]
+//! temperature_c = [18.0, 22.0]      # outside of it, or where nobody says the temperature, nothing is decided
+//!
+//! [expansion]                       # of the part; the scan is corrected to 20 degrees
+//! coefficient_per_k = 11.5e-6
+//! u_coefficient_per_k = 1.0e-6
+//! u_temperature_k = 0.5
 //!
 //! [limits]                          # of every edge; without limits a value is not evaluated
 //! d_mm = [-0.1, 0.1]                # of d1 and d2; d1_mm and d2_mm name one
 //! included_angle_deg = [-0.5, 0.5]  # of the deviation from the nominal included angle
+//! burr_mm = 0.05                    # one number: the upper limit of what cannot be negative
+//! corner_mm = 0.1                   # of the distance of every corner from its nominal place
 //!
-//! [[edge]]
-//! entity = 123                      # the STEP entity of the edge, or: id = "e4"
+//! [[edge]]                          # for all edges between these angles ...
+//! turn_angle_deg = [80.0, 100.0]    # or kind = "convex", or box_mm = [[0, 0, 0], [50, 20, 5]] with the whole edge in it
+//! radius_mm = [0.1, 0.3]
+//!
+//! [[edge]]                          # ... and more for one: what is given later counts
+//! entity = 123                      # the STEP entity of the edge, or: id = "e4", or: faces = [17, 45], its two faces
 //! name = "sealing lip"              # optional
-//! d_mm = [-0.05, 0.02]              # what is not given here holds as in [limits]
+//! station_step_mm = 0.5
+//! d_mm = [-0.05, 0.02]              # what is not given here holds as above
 //!
 //! [[edge]]
 //! id = "e7"
 //! judged = false                    # nothing of it is evaluated; the default is true
+//!
+//! [[gap]]                           # between two edges
+//! name = "door"
+//! edges = ["e1", 123]               # ids or STEP entities
+//! gap_mm = [2.8, 3.2]
+//! flush_mm = [-0.2, 0.2]
 //! ```
 
-use acies_drivers::device::Mistake;
-use acies_drivers::settings::{Keys, number, numbers};
-use toml::Value;
+mod read;
+
+use glam::DVec3;
+
+pub use super::quantity::Limits;
+pub use super::verdict::Rule;
+use crate::nominal::EdgeKind;
 
 /// What an inspection is asked to judge.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Recipe {
+    /// SHA-256 of the text it was read from, in hexadecimal, as `sha256sum` prints it; empty for one that was not read.
+    pub sha256: String,
     /// How the uncertainty counts.
     pub rule: Rule,
     /// Limits of every edge for which `edges` says nothing else.
     pub limits: Limits,
-    /// Edges with a name or limits of their own, or out of judgement.
+    /// Largest distance of a corner from its nominal place, mm; `None` = not evaluated.
+    pub corner_mm: Option<f64>,
+    /// Edges with a name, limits or a step of their own, or out of judgement. Later entries count over earlier ones.
     pub edges: Vec<EdgeRecipe>,
+    /// Gaps between edges.
+    pub gaps: Vec<GapRecipe>,
     /// STEP entities of the faces that hold the alignment; empty = all faces.
     pub datum_faces: Vec<u64>,
     /// Share of an edge's length that must be measured for the edge to be decidable, 0 to 1.
     pub minimum_coverage: f64,
+    /// Whether a missing edge that has limits makes the part not OK.
+    pub missing_edges_count: bool,
+    /// Whether an edge that the nominal does not have makes the part not OK.
+    pub unexpected_edges_count: bool,
     /// Distance of the stations, mm; `None` = derived from the data.
     pub station_step_mm: Option<f64>,
+    /// Depth of the flanks, mm; `None` = derived from the data.
+    pub flank_mm: Option<f64>,
+    /// Length over which the direction of an edge is taken, mm; `None` = five stations.
+    pub direction_mm: Option<f64>,
     /// Standard uncertainty of d from the calibration of the sensor, mm.
     pub u_calibration_mm: f64,
     /// Standard uncertainty of the included angle from the calibration of the sensor, rad.
     pub u_calibration_rad: f64,
+    /// Temperatures of the part at which it may be judged, degrees Celsius; `None` = any.
+    pub temperature_c: Option<[f64; 2]>,
+    /// Thermal expansion of the part; `None` = not corrected.
+    pub expansion: Option<Expansion>,
+}
+
+/// Thermal expansion of the part.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Expansion {
+    /// Linear coefficient, 1/K.
+    pub coefficient_per_k: f64,
+    /// Its standard uncertainty, 1/K.
+    pub u_coefficient_per_k: f64,
+    /// Standard uncertainty of the part's temperature, K.
+    pub u_temperature_k: f64,
 }
 
 impl Default for Recipe {
     fn default() -> Self {
         Self {
+            sha256: String::new(),
             rule: Rule::Simple,
             limits: Limits::default(),
+            corner_mm: None,
             edges: Vec::new(),
+            gaps: Vec::new(),
             datum_faces: Vec::new(),
             minimum_coverage: 0.9,
+            missing_edges_count: true,
+            unexpected_edges_count: false,
             station_step_mm: None,
+            flank_mm: None,
+            direction_mm: None,
             u_calibration_mm: 0.0,
             u_calibration_rad: 0.0,
+            temperature_c: None,
+            expansion: None,
         }
     }
 }
 
-/// How the uncertainty of a value counts when it is compared with a limit.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Rule {
-    /// The value alone decides.
-    Simple,
-    /// A limit within this many standard uncertainties of the value leaves it undecided (ISO 14253-1).
-    GuardBand(f64),
+/// Which edges an entry of the recipe means: those to which all that is given applies.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Select {
+    /// Its STEP entity.
+    pub entity: Option<u64>,
+    /// Its id, `e1` ...
+    pub id: Option<String>,
+    /// The STEP entities of its two faces, in either order.
+    pub faces: Option<[u64; 2]>,
+    /// The whole edge lies in this box, mm: lowest and highest corner.
+    pub box_mm: Option<[DVec3; 2]>,
+    /// The turn angle lies between these along the whole edge, rad.
+    pub turn_angle_rad: Option<[f64; 2]>,
+    /// Convex or concave.
+    pub kind: Option<EdgeKind>,
 }
 
-/// Lower and upper limits that hold for one edge; `None` = not evaluated.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Limits {
-    /// Of d1 and d2, mm.
-    pub d_mm: [Option<[f64; 2]>; 2],
-    /// Of the included angle minus the nominal one, rad.
-    pub angle_rad: Option<[f64; 2]>,
+/// What an edge is selected by.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EdgeFacts {
+    /// Its id.
+    pub id: String,
+    /// Its STEP entity.
+    pub entity: u64,
+    /// The STEP entities of its faces.
+    pub faces: [u64; 2],
+    /// Convex or concave.
+    pub kind: EdgeKind,
+    /// Lowest and highest coordinates, mm.
+    pub box_mm: [DVec3; 2],
+    /// Smallest and largest turn angle along it, rad.
+    pub turn_angle_rad: [f64; 2],
 }
 
-impl Limits {
-    /// Whether nothing is evaluated.
-    pub fn is_empty(&self) -> bool {
-        *self == Self::default()
+impl Select {
+    /// Whether this means `edge`.
+    pub fn means(&self, edge: &EdgeFacts) -> bool {
+        let [low, high] = edge.box_mm;
+        let [least, most] = edge.turn_angle_rad;
+        self.entity.is_none_or(|entity| entity == edge.entity)
+            && self.id.as_ref().is_none_or(|id| *id == edge.id)
+            && self
+                .faces
+                .is_none_or(|[a, b]| [a, b] == edge.faces || [b, a] == edge.faces)
+            && self
+                .box_mm
+                .is_none_or(|[l, h]| low.cmpge(l).all() && high.cmple(h).all())
+            && self
+                .turn_angle_rad
+                .is_none_or(|[l, h]| least >= l && most <= h)
+            && self.kind.is_none_or(|kind| kind == edge.kind)
     }
 
-    /// These, and those of `general` where there are none.
-    fn or(self, general: Self) -> Self {
-        Self {
-            d_mm: [0, 1].map(|i| self.d_mm[i].or(general.d_mm[i])),
-            angle_rad: self.angle_rad.or(general.angle_rad),
-        }
+    /// In words, for a finding.
+    pub fn words(&self) -> String {
+        let mut words = Vec::new();
+        words.extend(self.entity.map(|entity| format!("#{entity}")));
+        words.extend(self.id.as_ref().map(|id| format!("{id:?}")));
+        words.extend(
+            self.faces
+                .map(|[a, b]| format!("the edge of faces #{a} and #{b}")),
+        );
+        words.extend(
+            self.box_mm
+                .map(|[l, h]| format!("an edge in the box {} to {} mm", l, h)),
+        );
+        words.extend(self.turn_angle_rad.map(|[l, h]| {
+            let (l, h) = (l.to_degrees(), h.to_degrees());
+            format!("an edge that turns by {l:.1} to {h:.1} degrees")
+        }));
+        words.extend(self.kind.map(|kind| match kind {
+            EdgeKind::Convex => "a convex edge".to_owned(),
+            EdgeKind::Concave => "a concave edge".to_owned(),
+        }));
+        words.join(", ")
     }
 }
 
-/// Which edge an entry of the recipe means.
+/// What the recipe says of the edges that one entry means.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct EdgeRecipe {
+    /// Which edges.
+    pub select: Select,
+    /// The name in the report; where several edges have it, with their ids behind it.
+    pub name: Option<String>,
+    /// The limits it gives itself.
+    pub limits: Limits,
+    /// Whether anything of the edge is evaluated; `None` = as said before.
+    pub judged: Option<bool>,
+    /// Distance of its stations, mm; `None` = as said before.
+    pub station_step_mm: Option<f64>,
+}
+
+/// All that the recipe says of one edge.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Resolved {
+    /// Its name, where it has one.
+    pub name: Option<String>,
+    /// Its limits; none where it is not judged.
+    pub limits: Limits,
+    /// Distance of its stations, mm; `None` = derived from the data.
+    pub station_step_mm: Option<f64>,
+}
+
+/// An edge that an entry names.
 #[derive(Debug, Clone, PartialEq)]
 pub enum EdgeKey {
     /// By its STEP entity.
@@ -104,181 +242,61 @@ pub enum EdgeKey {
     Id(String),
 }
 
-/// What the recipe says of one edge.
+/// Gap and flush between two edges.
 #[derive(Debug, Clone, PartialEq)]
-pub struct EdgeRecipe {
-    /// Which edge.
-    pub key: EdgeKey,
-    /// The name it gets in the report.
-    pub name: Option<String>,
-    /// All that hold for it: its own, and those of the recipe for what it does not give; none where it is not judged.
-    pub limits: Limits,
+pub struct GapRecipe {
+    /// The name in the report.
+    pub name: String,
+    /// The edge whose stations count, and the other.
+    pub edges: [EdgeKey; 2],
+    /// Limits of the gap, mm.
+    pub gap_mm: Option<[f64; 2]>,
+    /// Limits of the flush, mm.
+    pub flush_mm: Option<[f64; 2]>,
 }
 
 impl Recipe {
-    /// The recipe that `text` writes, or every mistake in it.
-    ///
-    /// # Errors
-    /// All mistakes at once: text that is no TOML, unknown keys, wrong types, limits upside down.
-    pub fn parse(text: &str) -> Result<Self, Vec<Mistake>> {
-        let table: toml::Table = text.parse().map_err(|error: toml::de::Error| {
-            let line = error.span().map_or(1, |span| line_of(text, span.start));
-            vec![Mistake {
-                key: "recipe".to_owned(),
-                found: format!("line {line}: {}", error.message()),
-                expected: "TOML".to_owned(),
-            }]
-        })?;
-        let mut keys = Keys::new(table);
-        let recipe = recipe(&mut keys);
-        keys.finish().map(|()| recipe)
-    }
-
-    /// What the recipe says of the edge with this id and entity.
-    pub fn edge(&self, id: &str, entity: u64) -> Option<&EdgeRecipe> {
-        self.edges.iter().find(|edge| match &edge.key {
-            EdgeKey::Entity(e) => *e == entity,
-            EdgeKey::Id(i) => i == id,
-        })
-    }
-
-    /// The limits of the edge with this id and entity.
-    pub fn limits(&self, id: &str, entity: u64) -> Limits {
-        self.edge(id, entity)
-            .map_or(self.limits, |edge| edge.limits)
-    }
-}
-
-fn line_of(text: &str, byte: usize) -> usize {
-    1 + text.bytes().take(byte).filter(|b| *b == b'\n').count()
-}
-
-fn recipe(keys: &mut Keys) -> Recipe {
-    let default = Recipe::default();
-    let mut limits = Limits::default();
-    if let Some(table) = keys.table("limits") {
-        let mut inner = Keys::new(table);
-        limits = own_limits(&mut inner);
-        keys.adopt("limits", inner);
-    }
-    Recipe {
-        rule: rule(keys).unwrap_or(default.rule),
-        limits,
-        edges: edges(keys, limits),
-        datum_faces: entities(keys, "datum_faces").unwrap_or_default(),
-        minimum_coverage: keys
-            .number("minimum_coverage", 0.0..=1.0)
-            .unwrap_or(default.minimum_coverage),
-        station_step_mm: keys.number("station_step_mm", 1e-3..=1e4),
-        u_calibration_mm: keys
-            .number("u_calibration_mm", 0.0..=10.0)
-            .unwrap_or(default.u_calibration_mm),
-        u_calibration_rad: keys
-            .number("u_calibration_rad", 0.0..=1.0)
-            .unwrap_or(default.u_calibration_rad),
-    }
-}
-
-fn rule(keys: &mut Keys) -> Option<Rule> {
-    let expected = "\"simple\" or { guard_band = k } with k of 0 to 10";
-    keys.read("rule", expected, |value| match value {
-        Value::String(word) if word == "simple" => Some(Rule::Simple),
-        Value::Table(table) if table.len() == 1 => {
-            let k = table.get("guard_band").and_then(number);
-            k.filter(|k| (0.0..=10.0).contains(k)).map(Rule::GuardBand)
+    /// All that holds for `edge`.
+    pub fn of(&self, edge: &EdgeFacts) -> Resolved {
+        let mut limits = Limits::default();
+        let (mut name, mut judged, mut step) = (None, true, self.station_step_mm);
+        for entry in self.edges.iter().filter(|entry| entry.select.means(edge)) {
+            name = entry.name.clone().or(name);
+            judged = entry.judged.unwrap_or(judged);
+            step = entry.station_step_mm.or(step);
+            limits = entry.limits.or(limits);
         }
-        _ => None,
-    })
-}
-
-fn entities(keys: &mut Keys, key: &'static str) -> Option<Vec<u64>> {
-    keys.read(key, "numbers of STEP entities", |value| {
-        value.as_array()?.iter().map(entity).collect()
-    })
-}
-
-/// STEP counts its entities from 1.
-fn entity(value: &Value) -> Option<u64> {
-    let entity = u64::try_from(value.as_integer()?).ok()?;
-    (entity > 0).then_some(entity)
-}
-
-/// The limits that the table itself gives.
-fn own_limits(keys: &mut Keys) -> Limits {
-    let both = pair(keys, "d_mm");
-    let d1 = pair(keys, "d1_mm").or(both);
-    let d2 = pair(keys, "d2_mm").or(both);
-    let angle = pair(keys, "included_angle_deg");
-    Limits {
-        d_mm: [d1, d2],
-        angle_rad: angle.map(|pair| pair.map(f64::to_radians)),
-    }
-}
-
-fn pair(keys: &mut Keys, key: &'static str) -> Option<[f64; 2]> {
-    let expected = "two numbers, the lower limit then the upper";
-    keys.read(key, expected, |value| {
-        numbers(value).filter(|[lower, upper]| lower <= upper)
-    })
-}
-
-fn edges(keys: &mut Keys, general: Limits) -> Vec<EdgeRecipe> {
-    let mut edges: Vec<EdgeRecipe> = Vec::new();
-    for (k, table) in keys.tables("edge").into_iter().enumerate() {
-        let place = format!("edge[{k}]");
-        let mut inner = Keys::new(table);
-        let edge = edge(&mut inner, general);
-        keys.adopt(&place, inner);
-        let Some(edge) = edge else { continue };
-        if edges.iter().any(|above| above.key == edge.key) {
-            keys.wrong(
-                &place,
-                "an edge that has an entry above",
-                "one entry an edge",
-            );
+        Resolved {
+            name,
+            limits: if judged {
+                limits.or(self.limits)
+            } else {
+                Limits::default()
+            },
+            station_step_mm: step,
         }
-        edges.push(edge);
     }
-    edges
-}
-
-fn edge(keys: &mut Keys, general: Limits) -> Option<EdgeRecipe> {
-    let key = edge_key(keys);
-    let name = keys.text("name");
-    let judged = keys.flag("judged").unwrap_or(true);
-    let own = own_limits(keys);
-    if !judged && !own.is_empty() {
-        keys.wrong("judged", "false beside limits", "one of the two");
-    }
-    let limits = if judged {
-        own.or(general)
-    } else {
-        Limits::default()
-    };
-    Some(EdgeRecipe {
-        key: key?,
-        name,
-        limits,
-    })
-}
-
-fn edge_key(keys: &mut Keys) -> Option<EdgeKey> {
-    let given = (keys.contains("entity"), keys.contains("id"));
-    let by_entity = keys.read("entity", "the number of a STEP entity", entity);
-    let by_id = keys.text("id");
-    match given {
-        (true, true) => keys.wrong("entity", "entity and id", "one of the two"),
-        (false, false) => keys.wrong("entity", "nothing", "entity or id, to say which edge"),
-        _ => {}
-    }
-    by_entity.map(EdgeKey::Entity).or(by_id.map(EdgeKey::Id))
 }
 
 #[cfg(test)]
 mod tests {
-    use std::f64::consts::PI;
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use acies_drivers::device::Mistake;
 
     use super::*;
+    use crate::inspect::quantity::Quantity;
+
+    fn facts(id: &str, entity: u64) -> EdgeFacts {
+        EdgeFacts {
+            id: id.to_owned(),
+            entity,
+            faces: [17, 45],
+            kind: EdgeKind::Convex,
+            box_mm: [DVec3::ZERO, DVec3::new(10.0, 0.0, 0.0)],
+            turn_angle_rad: [FRAC_PI_2; 2],
+        }
+    }
 
     #[test]
     fn the_example_of_the_documentation_is_read() {
@@ -293,12 +311,22 @@ mod tests {
         let recipe = Recipe::parse(&example).expect("the documented example is right");
         assert_eq!(recipe.rule, Rule::GuardBand(2.0));
         assert_eq!(recipe.datum_faces, [17, 45, 61]);
-        assert_eq!(recipe.limits("e9", 5).d_mm, [Some([-0.1, 0.1]); 2]);
-        let own = recipe.limits("e9", 123);
-        assert_eq!(own.d_mm, [Some([-0.05, 0.02]); 2]);
-        assert_eq!(own.angle_rad, recipe.limits.angle_rad);
-        assert!(own.angle_rad.is_some());
-        assert!(recipe.limits("e7", 5).is_empty());
+        let general = recipe.of(&facts("e9", 5)).limits;
+        assert_eq!(general.of(Quantity::D1), Some([-0.1, 0.1]));
+        assert_eq!(general.of(Quantity::Burr), Some([f64::NEG_INFINITY, 0.05]));
+        // 90 degrees lies in the window of the first entry.
+        assert_eq!(general.of(Quantity::BreakRadius), Some([0.1, 0.3]));
+        let own = recipe.of(&facts("e9", 123));
+        assert_eq!(own.limits.of(Quantity::D2), Some([-0.05, 0.02]));
+        assert_eq!(
+            own.limits.of(Quantity::AngleDeviation),
+            Some([-0.5f64.to_radians(), 0.5f64.to_radians()])
+        );
+        assert_eq!(own.name.as_deref(), Some("sealing lip"));
+        assert_eq!(own.station_step_mm, Some(0.5));
+        assert!(recipe.of(&facts("e7", 5)).limits.is_empty());
+        assert_eq!(recipe.gaps[0].edges[1], EdgeKey::Entity(123));
+        assert_eq!(recipe.temperature_c, Some([18.0, 22.0]));
     }
 
     #[test]
@@ -310,13 +338,46 @@ mod tests {
                     [[edge]]\nid = \"e4\"\njudged = false\n";
         let recipe = Recipe::parse(text).expect("a recipe");
         let general = Some([-0.1, 0.1]);
-        let of = |id| recipe.limits(id, 0);
+        let of = |id| recipe.of(&facts(id, 0)).limits;
         assert_eq!(of("e1"), recipe.limits);
-        assert_eq!(of("e2").d_mm, [general, Some([0.0, 1.0])]);
-        assert_eq!(of("e3").d_mm, [general; 2]);
-        assert_eq!(of("e3").angle_rad, Some([-PI, PI]));
+        assert_eq!(of("e2").of(Quantity::D1), general);
+        assert_eq!(of("e2").of(Quantity::D2), Some([0.0, 1.0]));
+        assert_eq!(of("e3").of(Quantity::D1), general);
+        assert_eq!(of("e3").of(Quantity::AngleDeviation), Some([-PI, PI]));
         assert_eq!(of("e4"), Limits::default());
         assert_eq!(of("e5"), recipe.limits);
+    }
+
+    #[test]
+    fn edges_are_selected_by_faces_box_angle_and_kind() {
+        let edge = facts("e1", 5);
+        let means = |text: &str| {
+            let text = format!("[[edge]]\n{text}");
+            let recipe = Recipe::parse(&text).unwrap_or_else(|mistakes| panic!("{mistakes:?}"));
+            recipe.edges[0].select.means(&edge)
+        };
+        assert!(means("faces = [45, 17]"));
+        assert!(!means("faces = [45, 18]"));
+        assert!(means("box_mm = [[0, 0, 0], [10, 1, 1]]"));
+        assert!(!means("box_mm = [[0, 0, 0], [9, 1, 1]]"));
+        assert!(means("turn_angle_deg = [80, 100]"));
+        assert!(!means("turn_angle_deg = [100, 180]"));
+        assert!(means("kind = \"convex\""));
+        assert!(!means("kind = \"convex\"\nfaces = [1, 2]"));
+    }
+
+    #[test]
+    fn a_recipe_is_known_by_the_hash_of_its_text() {
+        // The digest of no bytes, as published (FIPS 180-4 example files).
+        let empty = Recipe::parse("").expect("an empty recipe is the default");
+        assert_eq!(
+            empty.sha256,
+            "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855"
+        );
+        assert_ne!(
+            Recipe::parse("# a note").expect("a note").sha256,
+            empty.sha256
+        );
     }
 
     #[test]
@@ -329,14 +390,14 @@ mod tests {
         let mistakes = Recipe::parse(text).expect_err("thirteen mistakes");
         let lines: Vec<String> = mistakes.iter().map(Mistake::to_string).collect();
         for expected in [
-            "rule: \"strict\", expected \"simple\" or { guard_band = k } with k of 0 to 10",
+            "rule: \"strict\", expected \"simple\", { guard_band = k }",
             "minimum_coverage: 2, expected a number of 0 to 1",
-            "colour: an unknown key, expected one of limits, rule, edge",
+            "colour: an unknown key, expected one of limits, environment, expansion, rule, edge",
             "datum_faces: [\"a\"], expected numbers of STEP entities",
             "limits.d_mm: [0.1, -0.1], expected two numbers, the lower limit then the upper",
             "limits.width: an unknown key, expected one of d_mm",
             "edge[0].name: 3, expected a text",
-            "edge[0].entity: nothing, expected entity or id, to say which edge",
+            "edge[0].entity: nothing, expected entity, id, faces, box_mm, turn_angle_deg or kind, to say which edges",
             "edge[2].d1_mm: nan, expected two numbers",
             "edge[2]: an edge that has an entry above, expected one entry an edge",
             "edge[3].entity: 0, expected the number of a STEP entity",

@@ -7,6 +7,8 @@ use crate::geometry::RigidTransform;
 use crate::nominal::{EdgeKind, Station};
 use crate::points::Spacing;
 
+use super::characteristic::Characteristic;
+
 /// The answer of a value, an edge or a part. The worst rules upward, in this order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum Verdict {
@@ -27,6 +29,10 @@ pub struct Inspection {
     pub alignment: Alignment,
     /// One for every sharp edge of the nominal.
     pub edges: Vec<EdgeResult>,
+    /// Where three faces or more meet.
+    pub corners: Vec<CornerResult>,
+    /// Gap and flush, as the recipe asks.
+    pub gaps: Vec<GapResult>,
     /// Edges in the scan where the nominal has none: polylines, mm, part frame.
     pub unexpected_edges: Vec<Vec<DVec3>>,
     /// Ids of nominal edges without a detection although the data are adequate.
@@ -86,10 +92,86 @@ pub struct EdgeResult {
     pub stations: Vec<StationResult>,
     /// The shape of the edge itself, one a stretch of stations, in order of arc length; empty where it was not seen.
     pub breaks: Vec<EdgeBreak>,
+    /// The edge as a curve; `None` where fewer than four stations were measured.
+    pub form: Option<EdgeForm>,
+    /// The values that can be judged.
+    pub characteristics: Vec<Characteristic>,
     /// Mean deviations over the measured stations; `None` where none was measured.
     pub mean: Option<EdgeMean>,
-    /// Worst of the stations against the limits of the recipe.
+    /// Worst of the characteristics and the coverage.
     pub verdict: Verdict,
+}
+
+/// The measured edge as a curve. Source: features-and-standards, section 5, characteristics 14 and 15.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EdgeForm {
+    /// Diameter of the smallest cylinder around the measured points; `None` where the nominal edge is not straight.
+    pub straightness_mm: Option<Quantified>,
+    /// Twice the largest distance from the nominal edge.
+    pub line_profile_mm: Quantified,
+    /// Arc length of that place.
+    pub s_worst_mm: f64,
+    /// The same after the rigid motion that fits the edge alone best.
+    pub line_form_mm: Option<Quantified>,
+    /// Largest angle to the nominal tangent, and its arc length; `None` where no stretch is long enough.
+    pub direction_rad: Option<(Quantified, f64)>,
+}
+
+/// A corner as measured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CornerResult {
+    /// `c1`, `c2` ...
+    pub id: String,
+    /// Nominal place, mm.
+    pub nominal: DVec3,
+    /// STEP entities of its faces.
+    pub faces: Vec<u64>,
+    /// Ids of the edges that end in it.
+    pub edges: Vec<String>,
+    /// Intersection of the measured flanks, mm; `None` = not measured.
+    pub measured: Option<DVec3>,
+    /// Its distance from the nominal place.
+    pub total_mm: Option<Quantified>,
+    /// Root mean square of what the faces beyond three leave; `None` with three.
+    pub residual_mm: Option<f64>,
+    /// Largest distance allowed, mm.
+    pub limit_mm: Option<f64>,
+    /// Against that limit.
+    pub verdict: Verdict,
+    /// Why it was not measured; empty otherwise.
+    pub reason: String,
+}
+
+/// Gap and flush between two edges.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GapResult {
+    /// The recipe's name.
+    pub name: String,
+    /// Ids of the two edges.
+    pub edges: [String; 2],
+    /// One a station of the first edge that has the second opposite.
+    pub stations: Vec<GapStation>,
+    /// Limits of the gap, mm.
+    pub gap_limits_mm: Option<[f64; 2]>,
+    /// Limits of the flush, mm.
+    pub flush_limits_mm: Option<[f64; 2]>,
+    /// Worst of the stations.
+    pub verdict: Verdict,
+    /// Why nothing was measured; empty otherwise.
+    pub reason: String,
+}
+
+/// Gap and flush at a station.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GapStation {
+    /// Arc length on the first edge, mm.
+    pub s_mm: f64,
+    /// Distance of the two edges in the face.
+    pub gap_mm: Quantified,
+    /// Offset of the second edge along the normal of the face; plus = it stands out.
+    pub flush_mm: Quantified,
+    /// Gap and flush of the nominal, mm.
+    pub nominal_mm: [f64; 2],
 }
 
 /// Mean deviation of an edge.

@@ -6,11 +6,14 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use glam::DVec3;
 
 use super::Facts;
-use super::characteristic::{Criterion, characteristic, samples, spread};
+use super::characteristic::{on_the_wire, spread};
 use super::conclusion;
 use super::wire::{self, Quantity, Report, Status};
-use crate::inspect::recipe::{EdgeKey, Limits, Recipe, Rule};
-use crate::inspect::result::{Alignment, EdgeResult, Inspection, StationResult, Verdict};
+use crate::inspect::recipe::{Recipe, Rule};
+use crate::inspect::result::{
+    Alignment, BreakShape, Budget, CornerResult, EdgeBreak, EdgeForm, EdgeResult, GapResult,
+    Inspection, Measured, Quantified, StationResult, Verdict,
+};
 use crate::nominal::EdgeKind;
 
 impl Report {
@@ -23,12 +26,7 @@ impl Report {
         let edges: Vec<_> = inspection
             .edges
             .iter()
-            .enumerate()
-            .map(|(index, edge)| {
-                let limits = limits_of(&facts.recipe, index, edge);
-                let rule = facts.recipe.rule;
-                edge_from_result(edge, (&limits, rule), &mut findings)
-            })
+            .map(|edge| edge_from_result(edge, facts, &mut findings))
             .collect();
         let alignment = alignment_from_result(&inspection.alignment);
         // A good alignment makes no part OK: where no value was judged, nothing was.
@@ -60,6 +58,12 @@ impl Report {
             devices: devices_from_facts(facts),
             alignment,
             edges,
+            corners: inspection
+                .corners
+                .iter()
+                .filter_map(corner_from_result)
+                .collect(),
+            gaps: inspection.gaps.iter().map(gap_from_result).collect(),
             unexpected_edges: inspection
                 .unexpected_edges
                 .iter()
@@ -83,7 +87,7 @@ fn rfc3339(time: SystemTime) -> String {
 /// Beyond this (a thousand kilometres in mm) a number is as useless as infinity, and squares of it would overflow later.
 const LARGEST: f64 = 1e9;
 
-fn finite(value: f64) -> Option<f64> {
+pub(super) fn finite(value: f64) -> Option<f64> {
     (value.abs() <= LARGEST).then_some(value)
 }
 
@@ -96,7 +100,7 @@ fn xyz(v: DVec3) -> Option<wire::Xyz> {
     Some([x?, y?, z?])
 }
 
-fn status_from_verdict(verdict: Verdict) -> Status {
+pub(super) fn status_from_verdict(verdict: Verdict) -> Status {
     match verdict {
         Verdict::Undefined => Status::Undefined,
         Verdict::Ok => Status::Ok,
@@ -115,18 +119,24 @@ fn seconds_by_stage(seconds: &[(&'static str, f64)]) -> indexmap::IndexMap<Strin
 }
 
 fn recipe_on_the_wire(recipe: &Recipe) -> wire::Recipe {
-    let (rule, guard_band_k) = match recipe.rule {
-        Rule::Simple => (wire::Rule::Simple, None),
-        Rule::GuardBand(k) => (wire::Rule::GuardBand, finite(k)),
+    let (rule, guard_band_k, conformance_probability) = match recipe.rule {
+        Rule::Simple => (wire::Rule::Simple, None, None),
+        Rule::GuardBand(k) => (wire::Rule::GuardBand, finite(k), None),
+        Rule::Conformance(p) => (wire::Rule::Conformance, None, finite(p)),
     };
-    let [d1_mm, d2_mm] = recipe.limits.d_mm.map(finite_limits);
+    let limits = |quantity: Quantity| {
+        let limits = recipe.limits.of(quantity)?;
+        finite_limits(Some(limits.map(|limit| quantity.unit().outside(limit))))
+    };
     wire::Recipe {
+        sha256: recipe.sha256.clone(),
         rule,
         guard_band_k,
+        conformance_probability,
         limits: wire::Limits {
-            d1_mm,
-            d2_mm,
-            angle_deviation_deg: limits_in_degrees(recipe.limits.angle_rad),
+            d1_mm: limits(Quantity::D1),
+            d2_mm: limits(Quantity::D2),
+            angle_deviation_deg: limits(Quantity::AngleDeviation),
         },
         minimum_coverage: finite(recipe.minimum_coverage),
         u_calibration_mm: finite(recipe.u_calibration_mm),
@@ -134,22 +144,8 @@ fn recipe_on_the_wire(recipe: &Recipe) -> wire::Recipe {
     }
 }
 
-/// The limits of an edge that the recipe may know by its entity, by its number or, once named, by its name.
-fn limits_of(recipe: &Recipe, index: usize, edge: &EdgeResult) -> Limits {
-    let number = format!("e{}", index + 1);
-    let own = recipe.edges.iter().find(|own| match &own.key {
-        EdgeKey::Entity(entity) => *entity == edge.nominal_entity,
-        EdgeKey::Id(id) => *id == edge.id || *id == number,
-    });
-    own.map_or(recipe.limits, |own| own.limits)
-}
-
 fn finite_limits(limits: Option<[f64; 2]>) -> Option<[f64; 2]> {
     limits.filter(|limits| limits.iter().all(|limit| finite(*limit).is_some()))
-}
-
-fn limits_in_degrees(limits_rad: Option<[f64; 2]>) -> Option<[f64; 2]> {
-    finite_limits(limits_rad).map(|limits| limits.map(f64::to_degrees))
 }
 
 fn losses_from_device(losses: acies_drivers::device::Losses) -> wire::Losses {
@@ -221,15 +217,11 @@ fn alignment_from_result(alignment: &Alignment) -> wire::Alignment {
     }
 }
 
-fn edge_from_result(
-    edge: &EdgeResult,
-    criteria: (&Limits, Rule),
-    findings: &mut Vec<String>,
-) -> wire::Edge {
+fn edge_from_result(edge: &EdgeResult, facts: &Facts, findings: &mut Vec<String>) -> wire::Edge {
     let mut stations = Vec::with_capacity(edge.stations.len());
     let mut verdict = status_from_verdict(edge.verdict);
     for (index, result) in edge.stations.iter().enumerate() {
-        match station_from_result(result, edge.kind) {
+        match station_from_result(result, edge.kind, facts.with_budgets) {
             Some(station) => {
                 if station.status > status_from_verdict(result.verdict) {
                     verdict = verdict.max(station.status);
@@ -242,7 +234,15 @@ fn edge_from_result(
             )),
         }
     }
-    let (summary, characteristics) = evaluate(&edge.id, &stations, criteria);
+    let summary = summary(edge, &stations);
+    let characteristics = edge
+        .characteristics
+        .iter()
+        .map(|found| {
+            let budget = worst_budget(edge, found.quantity, found.s_mm);
+            on_the_wire(&edge.id, found, facts.recipe.rule, budget)
+        })
+        .collect();
     wire::Edge {
         id: edge.id.clone(),
         nominal_entity: edge.nominal_entity,
@@ -253,52 +253,151 @@ fn edge_from_result(
         length_mm: finite(edge.length_mm),
         coverage: finite(edge.coverage).unwrap_or(summary.measured_share),
         stations,
+        breaks: edge.breaks.iter().filter_map(break_from_result).collect(),
+        form: edge.form.as_ref().map(form_from_result),
         summary,
         characteristics,
         verdict,
     }
 }
 
-/// Summary and characteristics of one edge under its limits.
-fn evaluate(
-    id: &str,
-    stations: &[wire::Station],
-    (limits, rule): (&Limits, Rule),
-) -> (wire::Summary, Vec<wire::Characteristic>) {
-    let quantities = [
-        (Quantity::D1, finite_limits(limits.d_mm[0])),
-        (Quantity::D2, finite_limits(limits.d_mm[1])),
-        (
-            Quantity::AngleDeviation,
-            limits_in_degrees(limits.angle_rad),
-        ),
-    ];
-    let values = quantities.map(|(quantity, _)| samples(stations, quantity));
-    let spreads: [Option<wire::Spread>; 3] =
-        std::array::from_fn(|i| spread(&values[i], quantities[i].1));
+fn summary(edge: &EdgeResult, stations: &[wire::Station]) -> wire::Summary {
+    let of = |quantity| {
+        let mut all = edge.characteristics.iter();
+        all.find(|c| c.quantity == quantity).and_then(spread)
+    };
     let measured = stations.iter().filter(|s| s.measured.is_some()).count();
-    let summary = wire::Summary {
+    wire::Summary {
         stations: stations.len(),
         measured,
         measured_share: measured as f64 / stations.len().max(1) as f64,
-        d1_mm: spreads[0],
-        d2_mm: spreads[1],
-        angle_deviation_deg: spreads[2],
+        d1_mm: of(Quantity::D1),
+        d2_mm: of(Quantity::D2),
+        angle_deviation_deg: of(Quantity::AngleDeviation),
+    }
+}
+
+/// What the uncertainty of the worst value is made of, where that value belongs to a station.
+fn worst_budget(edge: &EdgeResult, quantity: Quantity, s_mm: Option<f64>) -> Option<Budget> {
+    let mut stations = edge.stations.iter();
+    let station = stations.find(|station| Some(station.station.s_mm) == s_mm)?;
+    let measured = station.measured.as_ref()?;
+    match quantity {
+        Quantity::D1 => Some(measured.budget_d[0]),
+        Quantity::D2 => Some(measured.budget_d[1]),
+        Quantity::AngleDeviation => Some(measured.budget_angle),
+        _ => None,
+    }
+}
+
+fn value(found: Quantified) -> wire::Value {
+    wire::Value {
+        value: finite(found.value),
+        u: finite(found.u),
+    }
+}
+
+fn value_in_degrees(found: Quantified) -> wire::Value {
+    wire::Value {
+        value: degrees(found.value),
+        u: degrees(found.u),
+    }
+}
+
+/// `None` where its place is no number.
+fn break_from_result(found: &EdgeBreak) -> Option<wire::Break> {
+    let mut stretch = wire::Break {
+        s_mm: [finite(found.s_mm[0])?, finite(found.s_mm[1])?],
+        shape: wire::Shape::Irregular,
+        radius_mm: None,
+        radius_below_mm: None,
+        chamfer_legs_mm: None,
+        chamfer_angle_deg: None,
+        detachment_mm: found.detachment_mm.map(value),
+        truncation_mm: value(found.truncation_mm),
+        burr_mm: value(found.burr_mm),
+        undercut_mm: found.undercut_mm.map(value),
+        points: found.points,
     };
-    let characteristics = quantities
-        .iter()
-        .zip(&values)
-        .map(|(&(quantity, limits), values)| {
-            characteristic(id, quantity, values, Criterion { limits, rule })
+    match found.shape {
+        BreakShape::Sharp { radius_below_mm } => {
+            stretch.shape = wire::Shape::Sharp;
+            stretch.radius_below_mm = finite(radius_below_mm);
+        }
+        BreakShape::Round { radius_mm } => {
+            stretch.shape = wire::Shape::Round;
+            stretch.radius_mm = Some(value(radius_mm));
+        }
+        BreakShape::Chamfer { legs_mm, angle_rad } => {
+            stretch.shape = wire::Shape::Chamfer;
+            stretch.chamfer_legs_mm = Some(legs_mm.map(value));
+            stretch.chamfer_angle_deg = Some(value_in_degrees(angle_rad));
+        }
+        BreakShape::Irregular => {}
+    }
+    Some(stretch)
+}
+
+fn form_from_result(found: &EdgeForm) -> wire::Form {
+    wire::Form {
+        straightness_mm: found.straightness_mm.map(value),
+        line_profile_mm: value(found.line_profile_mm),
+        s_worst_mm: finite(found.s_worst_mm),
+        line_form_mm: found.line_form_mm.map(value),
+        direction_deg: found
+            .direction_rad
+            .map(|(found, _)| value_in_degrees(found)),
+    }
+}
+
+/// `None` where its nominal place is no number.
+fn corner_from_result(found: &CornerResult) -> Option<wire::Corner> {
+    Some(wire::Corner {
+        id: found.id.clone(),
+        nominal: xyz(found.nominal)?,
+        faces: found.faces.clone(),
+        edges: found.edges.clone(),
+        measured: found.measured.and_then(xyz),
+        total_mm: found.total_mm.and_then(|total| finite(total.value)),
+        u_total_mm: found.total_mm.and_then(|total| finite(total.u)),
+        residual_mm: found.residual_mm.and_then(finite),
+        upper_mm: found.limit_mm.and_then(finite),
+        verdict: status_from_verdict(found.verdict),
+        reason: found.reason.clone(),
+    })
+}
+
+fn gap_from_result(found: &GapResult) -> wire::Gap {
+    let stations = found.stations.iter().filter_map(|station| {
+        Some(wire::GapStation {
+            s_mm: finite(station.s_mm)?,
+            gap_mm: finite(station.gap_mm.value),
+            u_gap_mm: finite(station.gap_mm.u),
+            nominal_gap_mm: finite(station.nominal_mm[0]),
+            flush_mm: finite(station.flush_mm.value),
+            u_flush_mm: finite(station.flush_mm.u),
+            nominal_flush_mm: finite(station.nominal_mm[1]),
         })
-        .collect();
-    (summary, characteristics)
+    });
+    wire::Gap {
+        name: found.name.clone(),
+        edges: found.edges.clone(),
+        gap_limits_mm: finite_limits(found.gap_limits_mm),
+        flush_limits_mm: finite_limits(found.flush_limits_mm),
+        stations: stations.collect(),
+        verdict: status_from_verdict(found.verdict),
+        reason: found.reason.clone(),
+    }
 }
 
 const UNUSABLE: &str = "is not a number below 1e9";
 
 /// `None` where the nominal place itself is not finite.
-fn station_from_result(result: &StationResult, kind: EdgeKind) -> Option<wire::Station> {
+fn station_from_result(
+    result: &StationResult,
+    kind: EdgeKind,
+    with_budget: bool,
+) -> Option<wire::Station> {
     let place = &result.station;
     let turn_angle_rad = place.normals[0].angle_between(place.normals[1]);
     let nominal_included_angle_rad = match kind {
@@ -321,6 +420,7 @@ fn station_from_result(result: &StationResult, kind: EdgeKind) -> Option<wire::S
         u_included_angle_deg: None,
         residual_1_mm: None,
         residual_2_mm: None,
+        budget: None,
         points_1: result.points[0],
         points_2: result.points[1],
         status: status_from_verdict(result.verdict),
@@ -328,12 +428,24 @@ fn station_from_result(result: &StationResult, kind: EdgeKind) -> Option<wire::S
     };
     if let Some(measured) = &result.measured {
         fill_measured(&mut station, measured);
+        station.budget = with_budget.then(|| budgets(measured));
     }
     Some(station)
 }
 
+fn budgets(measured: &Measured) -> [wire::Budget; 3] {
+    let [d1, d2] = measured.budget_d;
+    let each = [(d1, 1.0), (d2, 1.0), (measured.budget_angle, 180.0 / PI)];
+    each.map(|(budget, scale)| wire::Budget {
+        points: finite(scale * budget.points),
+        alignment: finite(scale * budget.alignment),
+        calibration: finite(scale * budget.calibration),
+        temperature: finite(scale * budget.temperature),
+    })
+}
+
 /// Takes over what is finite; says what was not.
-fn fill_measured(station: &mut wire::Station, measured: &crate::inspect::result::Measured) {
+fn fill_measured(station: &mut wire::Station, measured: &Measured) {
     let point = xyz(measured.point);
     let [d1, d2] = measured.d_mm.map(finite);
     let (Some(_), Some(_), Some(_)) = (point, d1, d2) else {

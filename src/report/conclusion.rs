@@ -1,7 +1,7 @@
 //! Why the verdict is what it is, and what to do, in two sentences for the operator.
 
 use super::figure::Figure;
-use super::wire::{Characteristic, Edge, Quantity, Report, Status};
+use super::wire::{Characteristic, Edge, Report, Status};
 
 /// Reason and advice.
 pub fn conclude(report: &Report) -> (String, String) {
@@ -156,7 +156,7 @@ fn excess_over_limit(characteristic: &Characteristic) -> f64 {
 }
 
 /// 0 in the middle of the limits, 1 at a limit, more outside.
-fn used_share(characteristic: &Characteristic) -> f64 {
+pub fn used_share(characteristic: &Characteristic) -> f64 {
     match (
         characteristic.value,
         characteristic.lower,
@@ -165,12 +165,17 @@ fn used_share(characteristic: &Characteristic) -> f64 {
         (Some(value), Some(lower), Some(upper)) if upper > lower => {
             (value - 0.5 * (lower + upper)).abs() / (0.5 * (upper - lower))
         }
-        (Some(_), Some(_), Some(_)) => f64::MAX,
-        _ => 0.0,
+        (Some(value), None, Some(upper)) if upper > 0.0 => value / upper,
+        (Some(value), Some(lower), None) if value > 0.0 => lower / value,
+        (Some(_), None, None) | (None, ..) => 0.0,
+        (Some(_), ..) => f64::MAX,
     }
 }
 
 fn outside(characteristic: &Characteristic) -> String {
+    if characteristic.value.is_none() {
+        return format!("{}{}", stated(characteristic), limits(characteristic));
+    }
     format!(
         "{}, outside its limits{}",
         stated(characteristic),
@@ -179,6 +184,9 @@ fn outside(characteristic: &Characteristic) -> String {
 }
 
 fn inside_zone(characteristic: &Characteristic) -> String {
+    if characteristic.value.is_none() {
+        return format!("{}{}", stated(characteristic), limits(characteristic));
+    }
     format!(
         "{}; a limit lies inside this uncertainty{}",
         stated(characteristic),
@@ -197,30 +205,26 @@ fn limits(characteristic: &Characteristic) -> String {
                 figure(upper).with_unit()
             )
         }
-        _ => String::new(),
+        (None, Some(upper)) => format!(" (at most {})", figure(upper).with_unit()),
+        (Some(lower), None) => format!(" (at least {})", figure(lower).with_unit()),
+        (None, None) => String::new(),
     }
 }
 
 /// `d1 is +152 µm (U 12 µm) at 12.4 mm along the edge`.
 pub fn stated(characteristic: &Characteristic) -> String {
-    let name = quantity_name(characteristic.quantity);
+    let name = characteristic.quantity.words();
     let Some(value) = characteristic.value else {
-        return format!("{name} was not measured");
+        return match characteristic.reason.as_str() {
+            "" => format!("{name} was not measured"),
+            reason => format!("{name} has no value: {reason}"),
+        };
     };
     let figure = Figure::of(characteristic.quantity, value, characteristic.u);
     let place = characteristic
         .s_mm
         .map_or_else(String::new, |s| format!(" at {s:.1} mm along the edge"));
     format!("{name} is {}{place}", figure.with_uncertainty())
-}
-
-/// What people call the quantity.
-pub fn quantity_name(quantity: Quantity) -> &'static str {
-    match quantity {
-        Quantity::D1 => "d1",
-        Quantity::D2 => "d2",
-        Quantity::AngleDeviation => "the angle deviation",
-    }
 }
 
 fn others(count: usize) -> String {

@@ -1,6 +1,7 @@
 //! A value and its expanded uncertainty as people read them: µm or degrees, two significant digits of U.
 
 use super::wire::Quantity;
+use crate::inspect::quantity::Unit;
 
 /// Coverage factor of the uncertainties shown to people: about 95 % of a normal distribution.
 pub const COVERAGE_FACTOR: f64 = 2.0;
@@ -19,9 +20,9 @@ pub struct Figure {
 impl Figure {
     /// `value` and `u` in the unit of the wire (mm or degrees) as a figure in µm or degrees.
     pub fn of(quantity: Quantity, value: f64, u: Option<f64>) -> Self {
-        let (scale, unit, decimals_without_u) = match quantity {
-            Quantity::D1 | Quantity::D2 => (1e3, "µm", 0),
-            Quantity::AngleDeviation => (1.0, "°", 2),
+        let (scale, unit, decimals_without_u) = match quantity.unit() {
+            Unit::Length => (1e3, "µm", 0),
+            Unit::Angle => (1.0, "°", 2),
         };
         let expanded = u
             .map(|u| COVERAGE_FACTOR * u * scale)

@@ -7,12 +7,14 @@ mod drawing;
 mod facts;
 mod page;
 mod plot;
+mod values;
 
 use std::fmt::{self, Write};
 
 use base64::Engine as _;
 use sha2::{Digest, Sha256};
 
+use super::conclusion::used_share;
 use super::figure::Figure;
 use super::wire::{Characteristic, Edge, Kind, Quantity, Report, Status};
 use drawing::Drawing;
@@ -82,6 +84,7 @@ fn write_page(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt:
         write_view(out, &drawing)?;
     }
     write_edges(out, report, &shown)?;
+    values::write_corners_and_gaps(out, report)?;
     facts::write(out, report)?;
     out.write_str("</main>\n")?;
     write_footer(out, report)?;
@@ -179,14 +182,30 @@ fn write_table(out: &mut String, report: &Report) -> fmt::Result {
          <th scope=\"col\" class=\"n\">angle deviation<br>worst ± U, °</th><th scope=\"col\">measured</th>\
          <th scope=\"col\" class=\"n\">length<br>mm</th><th scope=\"col\">kind</th><th scope=\"col\" class=\"n\">STEP</th></tr></thead>\n<tbody>\n",
     )?;
-    for (index, edge) in report.edges.iter().enumerate() {
-        write_row(out, index, edge)?;
+    for index in worst_first(report) {
+        write_row(out, index, &report.edges[index])?;
     }
     out.write_str("</tbody></table></div>\n")?;
     out.write_str(
         "<p class=\"small soft\">d1 and d2 are the distances of the measured edge from the nominal one, along the outward normals of its two faces; \
          plus is material outside the nominal. U is twice the standard uncertainty: about 95 % of values lie within it.</p></section>\n",
     )
+}
+
+/// The edges by verdict, then by how much of their limits they use.
+fn worst_first(report: &Report) -> Vec<usize> {
+    let mut order: Vec<usize> = (0..report.edges.len()).collect();
+    let used = |index: &usize| {
+        let characteristics = report.edges[*index].characteristics.iter();
+        characteristics.map(used_share).fold(0.0, f64::max)
+    };
+    order.sort_by(|a, b| {
+        let verdict = |index: &usize| report.edges[*index].verdict;
+        verdict(b)
+            .cmp(&verdict(a))
+            .then(used(b).total_cmp(&used(a)))
+    });
+    order
 }
 
 fn write_row(out: &mut String, index: usize, edge: &Edge) -> fmt::Result {
@@ -196,8 +215,12 @@ fn write_row(out: &mut String, index: usize, edge: &Edge) -> fmt::Result {
         Escaped(&edge.id),
         State(edge.verdict)
     )?;
-    for characteristic in &edge.characteristics {
-        write_figure_cell(out, characteristic)?;
+    for quantity in [Quantity::D1, Quantity::D2, Quantity::AngleDeviation] {
+        let found = edge.characteristics.iter().find(|c| c.quantity == quantity);
+        match found {
+            Some(characteristic) => write_figure_cell(out, characteristic)?,
+            None => out.write_str("<td class=\"n soft\">not measured</td>")?,
+        }
     }
     let share = edge.coverage.clamp(0.0, 1.0);
     writeln!(
@@ -299,6 +322,7 @@ fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::
             plot::write(out, edge, Quantity::AngleDeviation, shown)?;
         }
         out.write_str("</div>")?;
+        values::write_edge(out, edge)?;
         if shown.len() < edge.stations.len() {
             write!(
                 out,

@@ -7,6 +7,8 @@ use indexmap::IndexMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+pub use crate::inspect::quantity::Quantity;
+
 /// A position (mm) or a direction: x, y, z.
 pub type Xyz = [f64; 3];
 
@@ -44,6 +46,10 @@ pub struct Report {
     pub alignment: Alignment,
     /// One for every sharp edge of the nominal.
     pub edges: Vec<Edge>,
+    /// Where three faces or more meet.
+    pub corners: Vec<Corner>,
+    /// Gap and flush between edges, as the recipe asks.
+    pub gaps: Vec<Gap>,
     /// Edges found where the nominal has none: polylines.
     pub unexpected_edges: Vec<Vec<Xyz>>,
     /// Ids of the nominal edges that were not found although the data are adequate.
@@ -90,10 +96,14 @@ pub struct Software {
 /// What the values were judged by. The limits themselves stand beside each characteristic.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 pub struct Recipe {
+    /// SHA-256 of the recipe's text, hexadecimal; empty where no file was read.
+    pub sha256: String,
     /// How the uncertainty of a value counts against a limit.
     pub rule: Rule,
     /// Half the width of the uncertainty zone in standard uncertainties; null for the simple rule.
     pub guard_band_k: Option<f64>,
+    /// Probability that conformity or its contrary must have; null for the other rules.
+    pub conformance_probability: Option<f64>,
     /// Limits of every edge for which the recipe says nothing else.
     pub limits: Limits,
     /// Share of an edge that must be measured for it to be decidable, 0 to 1.
@@ -112,6 +122,8 @@ pub enum Rule {
     Simple,
     /// A limit inside the uncertainty zone leaves the value undecided.
     GuardBand,
+    /// Conformity, or non-conformity, must be as probable as stated (in the manner of ISO 14253-1).
+    Conformance,
 }
 
 /// Lower and upper limits; null = not evaluated.
@@ -216,6 +228,10 @@ pub struct Edge {
     pub coverage: f64,
     /// In order of arc length.
     pub stations: Vec<Station>,
+    /// The shape of the edge itself, one a stretch of stations; empty where it was not seen.
+    pub breaks: Vec<Break>,
+    /// The edge as a curve; null where fewer than four stations were measured.
+    pub form: Option<Form>,
     /// The measured stations in a few numbers.
     pub summary: Summary,
     /// The values that have a verdict.
@@ -257,6 +273,9 @@ pub struct Station {
     pub residual_1_mm: Option<f64>,
     /// Residual standard deviation of the fit to the second flank.
     pub residual_2_mm: Option<f64>,
+    /// What u_d1, u_d2 and u_included_angle are made of; only where it was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub budget: Option<[Budget; 3]>,
     /// Points used on the first flank.
     pub points_1: usize,
     /// Points used on the second flank.
@@ -299,6 +318,159 @@ pub struct Spread {
     pub min: f64,
     /// Largest.
     pub max: f64,
+    /// Standard deviation over the stations.
+    pub standard_deviation: Option<f64>,
+    /// Root mean square.
+    pub rms: Option<f64>,
+    /// 2.5 per cent of the values lie below.
+    pub percentile_2_5: Option<f64>,
+    /// 97.5 per cent of the values lie below.
+    pub percentile_97_5: Option<f64>,
+    /// Share of the values outside the limits, 0 to 1; null without limits.
+    pub outside_share: Option<f64>,
+}
+
+/// What a standard uncertainty is made of, in the unit of its value; the parts add in squares.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Budget {
+    /// The points: noise, correlated noise, lack of fit.
+    pub points: Option<f64>,
+    /// The alignment, the same error for all values of the part.
+    pub alignment: Option<f64>,
+    /// The calibration of the sensors, the same error for all parts.
+    pub calibration: Option<f64>,
+    /// The temperature of the part.
+    pub temperature: Option<f64>,
+}
+
+/// A value with its standard uncertainty.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Value {
+    /// The value; null where it is no number.
+    pub value: Option<f64>,
+    /// Its standard uncertainty.
+    pub u: Option<f64>,
+}
+
+/// The real edge against the ideal sharp one, over a stretch of stations.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Break {
+    /// First and last arc length.
+    pub s_mm: [f64; 2],
+    /// What the shape is.
+    pub shape: Shape,
+    /// Radius of a round edge.
+    pub radius_mm: Option<Value>,
+    /// Where the edge is sharp as far as the data tell: a radius would be below this with 95 % probability.
+    pub radius_below_mm: Option<f64>,
+    /// Legs of a chamfer along the first and the second flank.
+    pub chamfer_legs_mm: Option<[Value; 2]>,
+    /// Angle of a chamfer to the first flank.
+    pub chamfer_angle_deg: Option<Value>,
+    /// Distance from the virtual edge to where each flank ends.
+    pub detachment_mm: [Value; 2],
+    /// Distance from the virtual edge to the highest place of the real profile.
+    pub truncation_mm: Value,
+    /// Largest excess outside the ideal sharp edge.
+    pub burr_mm: Value,
+    /// Largest depth missing inside it, along each normal.
+    pub undercut_mm: [Value; 2],
+    /// Points used.
+    pub points: usize,
+}
+
+/// The shape of an edge break.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Shape {
+    /// No break that the data can tell.
+    Sharp,
+    /// Tangent to both flanks.
+    Round,
+    /// A plane across both flanks.
+    Chamfer,
+    /// Neither.
+    Irregular,
+}
+
+/// The measured edge as a curve.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Form {
+    /// Diameter of the smallest cylinder around a straight edge; null for a curved one.
+    pub straightness_mm: Option<Value>,
+    /// Twice the largest distance from the nominal edge where the alignment puts it.
+    pub line_profile_mm: Value,
+    /// Arc length of that place.
+    pub s_worst_mm: Option<f64>,
+    /// The same with the edge moved to where it fits best.
+    pub line_form_mm: Option<Value>,
+    /// Largest angle to the nominal tangent.
+    pub direction_deg: Option<Value>,
+}
+
+/// Where three faces or more meet.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Corner {
+    /// `c1`, `c2` ...
+    pub id: String,
+    /// Nominal place.
+    pub nominal: Xyz,
+    /// STEP entities of its faces.
+    pub faces: Vec<u64>,
+    /// Ids of the edges that end in it.
+    pub edges: Vec<String>,
+    /// Intersection of the measured flanks; null = not measured.
+    pub measured: Option<Xyz>,
+    /// Its distance from the nominal place.
+    pub total_mm: Option<f64>,
+    /// Standard uncertainty of that distance.
+    pub u_total_mm: Option<f64>,
+    /// Root mean square of what the faces beyond three leave.
+    pub residual_mm: Option<f64>,
+    /// Largest distance allowed; null = not evaluated.
+    pub upper_mm: Option<f64>,
+    /// Against that limit.
+    pub verdict: Status,
+    /// Why it was not measured; empty otherwise.
+    pub reason: String,
+}
+
+/// Gap and flush between two edges.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Gap {
+    /// The recipe's name.
+    pub name: String,
+    /// Ids of the two edges.
+    pub edges: [String; 2],
+    /// Limits of the gap.
+    pub gap_limits_mm: Option<[f64; 2]>,
+    /// Limits of the flush.
+    pub flush_limits_mm: Option<[f64; 2]>,
+    /// In order of arc length on the first edge.
+    pub stations: Vec<GapStation>,
+    /// Worst of the stations.
+    pub verdict: Status,
+    /// Why nothing was measured; empty otherwise.
+    pub reason: String,
+}
+
+/// Gap and flush at one station.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct GapStation {
+    /// Arc length on the first edge.
+    pub s_mm: f64,
+    /// Distance of the edges in the face beside the gap.
+    pub gap_mm: Option<f64>,
+    /// Its standard uncertainty.
+    pub u_gap_mm: Option<f64>,
+    /// The nominal gap.
+    pub nominal_gap_mm: Option<f64>,
+    /// Offset of the second edge along the normal of that face.
+    pub flush_mm: Option<f64>,
+    /// Its standard uncertainty.
+    pub u_flush_mm: Option<f64>,
+    /// The nominal flush.
+    pub nominal_flush_mm: Option<f64>,
 }
 
 /// A value of an edge with its limits and its verdict.
@@ -316,24 +488,18 @@ pub struct Characteristic {
     pub u: Option<f64>,
     /// Where: arc length.
     pub s_mm: Option<f64>,
-    /// Lower limit; null = not evaluated.
+    /// Lower limit; null = none on this side.
     pub lower: Option<f64>,
-    /// Upper limit; null = not evaluated.
+    /// Upper limit; null = none on this side.
     pub upper: Option<f64>,
-    /// Worst verdict of all measured stations.
+    /// Probability that the value conforms; null where the rule asks for none.
+    pub conformance: Option<f64>,
+    /// Worst verdict of all its values.
     pub verdict: Status,
-}
-
-/// What a characteristic compares.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Quantity {
-    /// Deviation along n1.
-    D1,
-    /// Deviation along n2.
-    D2,
-    /// Included angle minus the nominal one.
-    AngleDeviation,
+    /// Why it has no value, or why it is not decidable; empty otherwise.
+    pub reason: String,
+    /// What u is made of; null where it is not known apart.
+    pub budget: Option<Budget>,
 }
 
 impl Report {

@@ -134,37 +134,6 @@ fn each_verdict_has_its_own_reason_and_advice() {
 }
 
 #[test]
-fn an_edge_is_judged_by_its_own_limits_however_the_recipe_names_it() {
-    use acies::inspect::recipe::{EdgeKey, EdgeRecipe, Limits};
-    let mut inspection = part::inspection(4);
-    inspection.edges[1].id = "sealing lip".to_owned();
-    let entity = inspection.edges[1].nominal_entity;
-    let wide = Limits {
-        d_mm: [Some([-0.5, 0.5]); 2],
-        angle_rad: None,
-    };
-    for key in [
-        EdgeKey::Entity(entity),
-        EdgeKey::Id("e2".into()),
-        EdgeKey::Id("sealing lip".into()),
-    ] {
-        let mut facts = part::facts();
-        facts.recipe.edges = vec![EdgeRecipe {
-            key,
-            name: None,
-            limits: wide,
-        }];
-        let report = Report::new(&inspection, &facts);
-        let upper = |edge: usize| report.edges[edge].characteristics[0].upper;
-        assert_eq!((upper(0), upper(1)), (Some(0.1), Some(0.5)));
-        assert_eq!(
-            report.edges[1].characteristics[2].upper, None,
-            "not given: not evaluated"
-        );
-    }
-}
-
-#[test]
 fn values_without_limits_are_stated_and_not_judged() {
     let mut inspection = part::inspection(4);
     for edge in &mut inspection.edges {
@@ -173,6 +142,7 @@ fn values_without_limits_are_stated_and_not_judged() {
     inspection.verdict = acies::inspect::result::Verdict::Ok;
     let mut facts = part::facts();
     facts.recipe = Default::default();
+    part::judge_again(&mut inspection, &facts.recipe);
     let report = Report::new(&inspection, &facts);
     assert_eq!(report.verdict, acies::report::wire::Status::Undefined);
     assert_eq!(report.advice, "give limits in a recipe to get a verdict");

@@ -4,6 +4,8 @@ use std::f64::consts::TAU;
 use std::time::{Duration, UNIX_EPOCH};
 
 use acies::geometry::RigidTransform;
+use acies::inspect::characteristic::{EdgeValues, characteristics};
+use acies::inspect::quantity::Quantity;
 use acies::inspect::recipe::{Limits, Recipe, Rule};
 use acies::inspect::result::{
     Alignment, Budget, EdgeResult, Inspection, Measured, StationResult, Verdict,
@@ -195,6 +197,8 @@ fn edge(index: usize, shape: &Shape, stations: usize, seed: &mut u64) -> EdgeRes
         length_mm: shape.length_mm,
         coverage: measured as f64 / stations.len() as f64,
         breaks: Vec::new(),
+        form: None,
+        characteristics: Vec::new(),
         mean: None,
         verdict: stations
             .iter()
@@ -202,6 +206,19 @@ fn edge(index: usize, shape: &Shape, stations: usize, seed: &mut u64) -> EdgeRes
             .max()
             .unwrap_or(Verdict::Undefined),
         stations,
+    }
+}
+
+/// Judges every value of `inspection` anew.
+pub fn judge_again(inspection: &mut Inspection, recipe: &Recipe) {
+    for edge in &mut inspection.edges {
+        let values = EdgeValues {
+            kind: edge.kind,
+            stations: &edge.stations,
+            breaks: &edge.breaks,
+            form: edge.form.as_ref(),
+        };
+        edge.characteristics = characteristics(&values, &recipe.limits, recipe.rule);
     }
 }
 
@@ -217,7 +234,9 @@ pub fn inspection(stations: usize) -> Inspection {
     for (i, row) in covariance.iter_mut().enumerate() {
         row[i] = if i < 3 { 4e-10 } else { 4e-6 };
     }
-    Inspection {
+    let mut inspection = Inspection {
+        corners: Vec::new(),
+        gaps: Vec::new(),
         alignment: Alignment {
             part_from_machine: RigidTransform::new(
                 DQuat::from_rotation_z(0.52),
@@ -246,7 +265,9 @@ pub fn inspection(stations: usize) -> Inspection {
             "213 points lie more than 2 mm from every face and were not used".to_owned(),
         ],
         scan: None,
-    }
+    };
+    judge_again(&mut inspection, &facts().recipe);
+    inspection
 }
 
 /// Facts beside it: a simulated cell with a profiler and a probe.
@@ -258,6 +279,7 @@ pub fn facts() -> Facts {
         firmware: "1.0.3".to_owned(),
     };
     Facts {
+        with_budgets: false,
         part: "stepped block".to_owned(),
         nominal: "stepped-block.step".to_owned(),
         created: UNIX_EPOCH + Duration::from_secs(1_780_000_000),
@@ -289,10 +311,13 @@ pub fn facts() -> Facts {
         ],
         recipe: Recipe {
             rule: Rule::GuardBand(2.0),
-            limits: Limits {
-                d_mm: [Some([-LIMIT_MM, LIMIT_MM]); 2],
-                angle_rad: Some([-1f64.to_radians(), 1f64.to_radians()]),
-            },
+            limits: Limits::default()
+                .with(Quantity::D1, [-LIMIT_MM, LIMIT_MM])
+                .with(Quantity::D2, [-LIMIT_MM, LIMIT_MM])
+                .with(
+                    Quantity::AngleDeviation,
+                    [-1f64.to_radians(), 1f64.to_radians()],
+                ),
             ..Recipe::default()
         },
     }
@@ -329,6 +354,7 @@ pub fn spoil(
         17 => inspection.alignment.part_from_machine.translation.x = bad,
         18 => inspection.unexpected_edges[0][1].z = bad,
         19 => facts.scan.noise_mm = Some(bad),
-        _ => facts.recipe.limits.d_mm[0] = Some([-bad, bad]),
+        _ => facts.recipe.limits = facts.recipe.limits.with(Quantity::D1, [-bad, bad]),
     }
+    judge_again(inspection, &facts.recipe);
 }

@@ -116,6 +116,10 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
             "a value within {} standard uncertainties of a limit is not decidable",
             k.unwrap_or(COVERAGE_FACTOR)
         ),
+        (Rule::Conformance, _) => format!(
+            "conformity or non-conformity must be probable to {} %",
+            100.0 * recipe.conformance_probability.unwrap_or(0.95)
+        ),
     };
     row(out, "rule", &rule)?;
     if let Some(share) = recipe.minimum_coverage {
@@ -127,6 +131,9 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
         "u of d from the calibration",
         &um(recipe.u_calibration_mm),
     )?;
+    if !recipe.sha256.is_empty() {
+        row(out, "SHA-256 of the recipe", &recipe.sha256)?;
+    }
     out.write_str("</table>\n")
 }
 

@@ -3,6 +3,7 @@
 use std::fmt::{self, Write};
 
 use super::page::class;
+use crate::inspect::quantity::Unit;
 use crate::report::characteristic::sample;
 use crate::report::figure::{COVERAGE_FACTOR, Figure};
 use crate::report::wire::{Characteristic, Edge, Quantity, Status};
@@ -51,9 +52,9 @@ pub fn write(out: &mut String, edge: &Edge, quantity: Quantity, shown: &[usize])
     let Some(characteristic) = edge.characteristics.iter().find(|c| c.quantity == quantity) else {
         return Ok(());
     };
-    let scale = match quantity {
-        Quantity::D1 | Quantity::D2 => 1e3,
-        Quantity::AngleDeviation => 1.0,
+    let scale = match quantity.unit() {
+        Unit::Length => 1e3,
+        Unit::Angle => 1.0,
     };
     let dots = dots(edge, (quantity, scale), shown);
     let axes = axes(edge, (&dots, scale), characteristic);
@@ -73,6 +74,7 @@ pub fn write(out: &mut String, edge: &Edge, quantity: Quantity, shown: &[usize])
         Quantity::D1 => "d1, µm, along n1",
         Quantity::D2 => "d2, µm, along n2",
         Quantity::AngleDeviation => "included angle minus nominal, °",
+        other => other.words(),
     };
     writeln!(
         out,

@@ -1,0 +1,297 @@
+//! Whole inspections with a recipe: corners, gaps, edges that are missing or too many, the environment, form.
+
+use std::f64::consts::PI;
+
+use acies::inspect::body::Body;
+use acies::inspect::quantity::Quantity;
+use acies::inspect::result::{Inspection, Verdict};
+use acies::inspect::{Recipe, Request, Start, inspect};
+use acies::points::PointCloud;
+use glam::{DMat3, DVec2, DVec3};
+
+use super::SIGMA;
+use super::solids::{Made, Noise, Solid};
+
+fn recipe(text: &str) -> Recipe {
+    Recipe::parse(text).unwrap_or_else(|mistakes| panic!("{mistakes:?}"))
+}
+
+fn inspected(solid: &Solid, cloud: &PointCloud, text: &str) -> Inspection {
+    let recipe = recipe(text);
+    inspect(cloud, solid, &Request::new(&recipe, Start::None))
+}
+
+fn outline(points: &[(f64, f64)]) -> Vec<DVec2> {
+    points.iter().copied().map(DVec2::from).collect()
+}
+
+/// The faces of a prism: 0 bottom, 1 top, then one a side.
+fn all_but_the_bottom(solid: &Solid) -> Vec<u32> {
+    (1..solid.face_count() as u32).collect()
+}
+
+#[test]
+fn corners_are_where_the_made_faces_meet() {
+    let mut noise = Noise(41);
+    let mut solid = Solid::cuboid(20.0, 14.0, 10.0);
+    // Top, front (y = 0), right (x = 20), back, left.
+    let offsets = [0.0, 0.05, -0.04, 0.03, 0.02, -0.06];
+    for (made, offset) in solid.made.iter_mut().zip(offsets) {
+        *made = Made {
+            offset,
+            gradient: DVec3::ZERO,
+        };
+    }
+    let cloud = solid.scan(&all_but_the_bottom(&solid), SIGMA, &mut noise);
+    let found = inspected(&solid, &cloud, "[limits]\ncorner_mm = 0.08");
+    assert_eq!(found.corners.len(), 8);
+    let normals = [
+        -DVec3::Z,
+        DVec3::Z,
+        -DVec3::Y,
+        DVec3::X,
+        DVec3::Y,
+        -DVec3::X,
+    ];
+    let mut measured = 0;
+    for corner in &found.corners {
+        if corner.nominal.z == 0.0 {
+            assert_eq!(corner.measured, None, "{corner:?}");
+            assert_eq!(corner.verdict, Verdict::NotDecidable);
+            assert!(corner.reason.contains("not measured"), "{}", corner.reason);
+            continue;
+        }
+        measured += 1;
+        let at_face = |n: &DVec3| {
+            let height = if n.x + n.y + n.z > 0.0 {
+                n.dot(DVec3::new(20.0, 14.0, 10.0))
+            } else {
+                0.0
+            };
+            (n.dot(corner.nominal) - height).abs() < 1e-9
+        };
+        let truth: DVec3 = normals
+            .iter()
+            .zip(offsets)
+            .filter(|(n, _)| at_face(n))
+            .map(|(n, offset)| offset * *n)
+            .sum();
+        let total = corner.total_mm.expect("the upper corners are seen");
+        let error = total.value - truth.length();
+        assert!(error.abs() < 4.0 * total.u, "{corner:?}, truth {truth}");
+        assert!(total.u < SIGMA, "a corner is better known than a point");
+        let expected = if truth.length() < 0.08 {
+            Verdict::Ok
+        } else {
+            Verdict::NotOk
+        };
+        assert_eq!(corner.verdict, expected, "{corner:?}");
+    }
+    assert_eq!(measured, 4);
+    // Independent of the code under test: three planes meet where the matrix of their normals says.
+    let matrix = DMat3::from_cols(DVec3::Z, -DVec3::Y, DVec3::X);
+    assert!((matrix.determinant().abs() - 1.0).abs() < 1e-12);
+}
+
+/// A U: the two arms face each other across a slot of 10 mm, and end on one height.
+const SLOT: [(f64, f64); 8] = [
+    (0.0, 0.0),
+    (30.0, 0.0),
+    (30.0, 10.0),
+    (20.0, 10.0),
+    (20.0, 5.0),
+    (10.0, 5.0),
+    (10.0, 10.0),
+    (0.0, 10.0),
+];
+
+#[test]
+fn gap_and_flush_are_those_of_the_made_arms() {
+    let mut noise = Noise(42);
+    let mut solid = Solid::prism(&outline(&SLOT), 25.0);
+    let made = |offset| Made {
+        offset,
+        gradient: DVec3::ZERO,
+    };
+    // Sides in the order of the outline: 4 = top of the right arm, 5 = its wall, 7 = the left arm's wall, 8 = its top.
+    solid.made[4] = made(0.03);
+    solid.made[5] = made(0.06);
+    solid.made[7] = made(-0.02);
+    solid.made[8] = made(-0.05);
+    let seen: Vec<u32> = (2..10).collect();
+    let cloud = solid.scan(&seen, SIGMA, &mut noise);
+    let edge = |x: f64| {
+        let edges = solid.edges();
+        let place = |e: usize| solid.station(e, 0.5 * edges[e].length_mm).point;
+        let found = (0..edges.len()).find(|e| place(*e).distance(DVec3::new(x, 10.0, 12.5)) < 1e-6);
+        edges[found.expect("an edge along z")].id.clone()
+    };
+    let text = format!(
+        "[[gap]]\nname = \"slot\"\nedges = [{:?}, {:?}]\ngap_mm = [9.9, 10.1]\nflush_mm = [-0.05, 0.05]\n\
+         [[gap]]\nname = \"nowhere\"\nedges = [\"e1\", 77]",
+        edge(10.0),
+        edge(20.0)
+    );
+    let found = inspected(&solid, &cloud, &text);
+    assert_eq!(found.gaps.len(), 1);
+    assert!(found.findings.iter().any(|f| f.contains("nowhere")));
+    let slot = &found.gaps[0];
+    assert!(slot.stations.len() > 5, "{}", slot.stations.len());
+    for station in &slot.stations {
+        assert_eq!(station.nominal_mm.map(|v| (v * 1e9).round()), [1e10, 0.0]);
+        let gap = station.gap_mm.value - (10.0 - 0.06 + 0.02);
+        let flush = station.flush_mm.value - (0.03 + 0.05);
+        assert!(gap.abs() < 4.0 * station.gap_mm.u, "{station:?}");
+        assert!(flush.abs() < 4.0 * station.flush_mm.u, "{station:?}");
+    }
+    assert_eq!(slot.verdict, Verdict::NotOk, "the flush is 0.08");
+    assert_eq!(found.verdict, Verdict::NotOk);
+}
+
+#[test]
+fn an_edge_that_was_never_made_is_missing_and_makes_the_part_not_ok() {
+    let mut noise = Noise(43);
+    // A roof of 5 degrees on either side; made is a flat top at half its height.
+    let rise = 15.0 * 5f64.to_radians().tan();
+    let roof = Solid::prism(
+        &outline(&[
+            (0.0, 0.0),
+            (30.0, 0.0),
+            (30.0, 10.0),
+            (15.0, 10.0 + rise),
+            (0.0, 10.0),
+        ]),
+        30.0,
+    );
+    let flat = Solid::cuboid(30.0, 10.0 + 0.5 * rise, 30.0);
+    let cloud = flat.scan(&[1, 2, 3, 4, 5], SIGMA, &mut noise);
+    let ridge = {
+        let edges = roof.edges();
+        let turned = |e: &usize| {
+            let station = roof.station(*e, 1.0);
+            station.normals[0].angle_between(station.normals[1]) < 0.3
+        };
+        edges[(0..edges.len()).find(turned).expect("the ridge")]
+            .id
+            .clone()
+    };
+    let wide = format!("[[edge]]\nid = {ridge:?}\nd_mm = [-5, 5]");
+    let found = inspected(&roof, &cloud, &wide);
+    let of_ridge = found.edges.iter().find(|e| e.id == ridge);
+    let reasons: Vec<&str> = of_ridge
+        .iter()
+        .flat_map(|e| e.stations.iter().map(|s| s.reason.as_str()))
+        .collect();
+    assert!(found.missing_edges.contains(&ridge), "{reasons:?}");
+    assert_eq!(found.verdict, Verdict::NotOk);
+    let lenient = format!("missing_edges = \"report\"\n{wide}");
+    let found = inspected(&roof, &cloud, &lenient);
+    assert!(found.missing_edges.contains(&ridge));
+    assert_ne!(found.verdict, Verdict::NotOk);
+}
+
+#[test]
+fn a_step_that_the_nominal_does_not_have_is_unexpected() {
+    let mut noise = Noise(44);
+    let nominal = Solid::prism(
+        &outline(&[(0.0, 0.0), (30.0, 0.0), (30.0, 10.0), (0.0, 10.0)]),
+        20.0,
+    );
+    let stepped = Solid::prism(
+        &outline(&[
+            (0.0, 0.0),
+            (30.0, 0.0),
+            (30.0, 10.0),
+            (13.0, 10.0),
+            (13.0, 9.2),
+            (0.0, 9.2),
+        ]),
+        20.0,
+    );
+    let seen: Vec<u32> = (1..stepped.face_count() as u32).collect();
+    let cloud = stepped.scan(&seen, SIGMA, &mut noise);
+    let found = inspected(&nominal, &cloud, "unexpected_edges = \"not_ok\"");
+    let step = found
+        .unexpected_edges
+        .iter()
+        .flatten()
+        .filter(|p| (p.x - 13.0).abs() < 1.0 && p.y > 8.5)
+        .count();
+    assert!(step > 5, "{:?}", found.unexpected_edges);
+    assert_eq!(found.verdict, Verdict::NotOk);
+    let found = inspected(&nominal, &cloud, "");
+    assert!(!found.unexpected_edges.is_empty());
+    assert_eq!(found.verdict, Verdict::Undefined);
+}
+
+#[test]
+fn nothing_is_decided_outside_the_temperatures_of_the_recipe_or_without_one() {
+    let mut noise = Noise(45);
+    let solid = Solid::cuboid(12.0, 10.0, 8.0);
+    let cloud = solid.scan(&all_but_the_bottom(&solid), SIGMA, &mut noise);
+    let recipe = recipe(
+        "minimum_coverage = 0.0\n[environment]\ntemperature_c = [18, 22]\n[limits]\nd_mm = [-0.5, 0.5]",
+    );
+    let verdict = |temperature_c| {
+        let request = Request {
+            temperature_c,
+            ..Request::new(&recipe, Start::None)
+        };
+        let found = inspect(&cloud, &solid, &request);
+        let said = found.findings.iter().any(|f| f.starts_with("temperature"));
+        (found.verdict, said)
+    };
+    assert_eq!(verdict(Some(20.0)), (Verdict::Ok, false));
+    assert_eq!(verdict(Some(23.0)), (Verdict::NotDecidable, true));
+    assert_eq!(verdict(None), (Verdict::NotDecidable, true));
+}
+
+/// A face that is off and tilted moves a straight edge as a whole: a line profile, no form, and the direction of the tilt.
+#[test]
+fn form_along_an_edge_is_apart_from_its_place() {
+    let mut noise = Noise(46);
+    let mut solid = Solid::cuboid(40.0, 14.0, 10.0);
+    // The front face y = 0 turns about z by 2 mrad: its edges run askew by as much.
+    solid.made[2] = Made {
+        offset: 0.1,
+        gradient: 0.002 * DVec3::X,
+    };
+    let cloud = solid.scan(&all_but_the_bottom(&solid), SIGMA, &mut noise);
+    let text = "[limits]\nstraightness_mm = 0.05\nline_profile_mm = 0.1";
+    let found = inspected(&solid, &cloud, text);
+    let edges = solid.edges();
+    let top_front = (0..edges.len())
+        .find(|e| {
+            let place = solid.station(*e, 0.5 * edges[*e].length_mm).point;
+            place.distance(DVec3::new(20.0, 0.0, 10.0)) < 1e-6
+        })
+        .expect("the upper front edge");
+    let edge = &found.edges[top_front];
+    let form = edge.form.expect("it was measured");
+    let profile = form.line_profile_mm;
+    // 0.1 mm and 2 mrad over half of the length less half a station: a station is at most 3 mm here.
+    assert!((profile.value - 2.0 * (0.1 + 0.04)).abs() < 2.0 * 0.003 + 4.0 * profile.u);
+    let straightness = form.straightness_mm.expect("straight");
+    assert!(straightness.value < 0.02, "{straightness:?}");
+    assert!(form.line_form_mm.expect("stations").value < 0.02);
+    let (direction, _) = form.direction_rad.expect("stations");
+    assert!(
+        (direction.value - 0.002).abs() < 5.0 * direction.u + 1e-4,
+        "{direction:?}"
+    );
+    let verdict = |quantity| {
+        let found = edge.characteristics.iter().find(|c| c.quantity == quantity);
+        found.map(|c| c.verdict)
+    };
+    assert_eq!(verdict(Quantity::Straightness), Some(Verdict::Ok));
+    assert_eq!(verdict(Quantity::LineProfile), Some(Verdict::NotOk));
+    let angle = edge
+        .characteristics
+        .iter()
+        .find(|c| c.quantity == Quantity::AngleDeviation);
+    assert!(
+        angle
+            .and_then(|c| c.statistics)
+            .is_some_and(|s| s.max.abs() < PI / 180.0)
+    );
+}
