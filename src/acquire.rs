@@ -3,6 +3,7 @@
 //! A pose is joined by the encoder, never by the host's clock. What is lost stays a gap: nothing is interpolated across it.
 
 mod assembler;
+pub mod calibrate;
 mod run;
 
 use glam::DVec3;

@@ -77,6 +77,26 @@ pub fn detect(cloud: &PointCloud, neighbors: &Neighbors, method: Method) -> Dete
     let spacing = spacing(cloud, neighbors);
     let noise = noise_mm(cloud, neighbors, &spacing);
     clock.lap("spacing and noise");
+    detect_within(cloud, neighbors, (spacing, noise), method, clock)
+}
+
+/// As [`detect`], for a cloud whose `spacing` and noise (mm) are known already.
+pub fn detect_knowing(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    known: (Spacing, f64),
+    method: Method,
+) -> Detection {
+    detect_within(cloud, neighbors, known, method, Clock::new())
+}
+
+fn detect_within(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    (spacing, noise): (Spacing, f64),
+    method: Method,
+    mut clock: Clock,
+) -> Detection {
     let mut detection = Detection {
         classes: vec![Class::None; cloud.positions.len()],
         spacing,

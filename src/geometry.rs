@@ -8,6 +8,7 @@ pub mod newton;
 pub mod nurbs_curve;
 pub mod nurbs_surface;
 pub mod rigid;
+pub mod sphere;
 pub mod surface;
 pub mod sweep;
 

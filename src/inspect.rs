@@ -117,7 +117,8 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     };
     let measured = measure_edges(&part, &places, &surface, &settings);
     stages.begin("comparison of edges found");
-    let detection = features::detect(cloud, &neighbors, Method::Adaptive);
+    let known = (scan.spacing, scan.noise_mm);
+    let detection = features::detect_knowing(cloud, &neighbors, known, Method::Adaptive);
     let edges = nominal.edges();
     let compared = compare::compare(&part, &detection, nominal, (&edges, &measured));
 

@@ -250,7 +250,7 @@ fn nothing_is_decided_outside_the_temperatures_of_the_recipe_or_without_one() {
 #[test]
 fn form_along_an_edge_is_apart_from_its_place() {
     let mut noise = Noise(46);
-    let mut solid = Solid::cuboid(40.0, 14.0, 10.0);
+    let mut solid = Solid::cuboid(40.0, 9.0, 6.0);
     // The front face y = 0 turns about z by 2 mrad: its edges run askew by as much.
     solid.made[2] = Made {
         offset: 0.1,
@@ -263,7 +263,7 @@ fn form_along_an_edge_is_apart_from_its_place() {
     let top_front = (0..edges.len())
         .find(|e| {
             let place = solid.station(*e, 0.5 * edges[*e].length_mm).point;
-            place.distance(DVec3::new(20.0, 0.0, 10.0)) < 1e-6
+            place.distance(DVec3::new(20.0, 0.0, 6.0)) < 1e-6
         })
         .expect("the upper front edge");
     let edge = &found.edges[top_front];
