@@ -2,6 +2,7 @@
 //!
 //! A pose is joined by the encoder, never by the host's clock. What is lost stays a gap: nothing is interpolated across it.
 
+pub mod acceptance;
 mod assembler;
 pub mod calibrate;
 mod run;

@@ -3,7 +3,7 @@
 //! Hides the order of things. What is announced is in the [`Outcome`]; what goes on meanwhile is told as [`State`]s.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use acies_drivers::capture::Touch;
 use acies_drivers::device::{Identity, Instrument, Probe};
@@ -195,6 +195,7 @@ pub fn run(
     };
     let mut inspection = inspect::inspect(&scan.cloud, &nominal, &request);
     judge_completeness(&scan, &mut inspection);
+    judge_calibrations(cell, SystemTime::now(), &mut inspection);
     Ok(Outcome {
         scan_seconds: (scanned - began).as_secs_f64(),
         verdict_seconds: scanned.elapsed().as_secs_f64(),
@@ -315,5 +316,21 @@ fn judge_completeness(scan: &Scan, inspection: &mut Inspection) {
         if !view.complete {
             inspection.verdict = inspection.verdict.max(Verdict::NotDecidable);
         }
+    }
+}
+
+/// A device whose calibration has run out decides nothing.
+fn judge_calibrations(cell: &Cell, now: SystemTime, inspection: &mut Inspection) {
+    let profilers = cell.profilers.iter().map(|p| (&p.name, p.calibrated));
+    let probes = cell.probes.iter().map(|p| (&p.name, p.calibrated));
+    for (name, calibrated) in profilers.chain(probes) {
+        let Some(until) = calibrated.and_then(|calibrated| calibrated.overdue(now)) else {
+            continue;
+        };
+        inspection.findings.push(format!(
+            "device {name:?}: its calibration held until {}, expected one that holds; calibrate it, then measure again",
+            humantime::format_rfc3339_seconds(until)
+        ));
+        inspection.verdict = inspection.verdict.max(Verdict::NotDecidable);
     }
 }

@@ -1,5 +1,7 @@
 //! The command line: one file a subcommand. Argument parsing only; the work is done by the modules above.
 
+mod attached_device;
+mod calibrate;
 mod check;
 mod demo;
 mod detect;
@@ -8,8 +10,11 @@ mod inspect;
 mod mesh;
 mod nominal;
 mod normals;
+mod probe;
 mod progress;
 mod reconstruct;
+mod record;
+mod replay;
 mod simulate;
 
 use std::process::ExitCode;
@@ -39,6 +44,14 @@ pub enum Command {
     Nominal(nominal::Nominals),
     /// Say everything that is wrong with a cell's configuration, touching no device.
     Check(check::Check),
+    /// Try one device of a cell by hand.
+    Probe(probe::Probe),
+    /// Write what passes between us and one device into a file.
+    Record(record::Record),
+    /// Play a recording back through its driver.
+    Replay(replay::ReplayCommand),
+    /// Find where a profiler stands from recordings of a reference sphere.
+    Calibrate(calibrate::Calibrate),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
     /// Play one simulated device on a pseudo-terminal or a socket.
@@ -60,6 +73,10 @@ impl Command {
             Command::Normals(command) => command.run(),
             Command::Nominal(command) => command.run(),
             Command::Check(command) => command.run(),
+            Command::Probe(command) => command.run(),
+            Command::Record(command) => command.run(),
+            Command::Replay(command) => command.run(),
+            Command::Calibrate(command) => command.run(),
             Command::Devices(command) => command.run(),
             Command::Simulate(command) => command.run(),
         }
@@ -114,6 +131,25 @@ impl Failure {
             Failure::Io(_) => 74,
         }
     }
+}
+
+/// A number of seconds above 0, for clap.
+fn positive_seconds(text: &str) -> Result<f64, String> {
+    let seconds = text.parse::<f64>().ok();
+    seconds
+        .filter(|s| *s > 0.0 && *s <= 1e6)
+        .ok_or_else(|| "expected seconds, above 0 and at most 1000000".to_owned())
+}
+
+/// Three finite numbers between commas, for clap.
+fn three_numbers(text: &str) -> Result<[f64; 3], String> {
+    let numbers: Option<Vec<f64>> = text
+        .split(',')
+        .map(|n| n.trim().parse().ok().filter(|n: &f64| n.is_finite()))
+        .collect();
+    numbers
+        .and_then(|numbers| numbers.try_into().ok())
+        .ok_or_else(|| "expected three numbers between commas, as in 10,20.5,30".to_owned())
 }
 
 /// Prints one line on standard output; a closed pipe ends the program quietly, as other tools do.

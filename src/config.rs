@@ -8,7 +8,7 @@ mod table;
 use std::collections::BTreeMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use acies_drivers::device::{Claim, Mistake, Setup};
 use acies_drivers::settings::Keys;
@@ -16,7 +16,7 @@ use glam::DVec3;
 
 use crate::acquire::{Calibration, ScanPlan};
 use crate::geometry::RigidTransform;
-use table::{Lines, pose, vector};
+use table::{Lines, calibrated, calibration, pose, vector};
 
 /// A profiler silent for this long has not reached the end of its scan: the slowest stages we know of trigger once a second.
 const SILENCE_S: f64 = 5.0;
@@ -52,6 +52,25 @@ pub struct ProfilerConfig {
     pub setup: Box<dyn Setup>,
     /// Where it is and how it moves.
     pub calibration: Calibration,
+    /// When that was found; `None` where nobody says.
+    pub calibrated: Option<Calibrated>,
+}
+
+/// When a device was calibrated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Calibrated {
+    /// The time.
+    pub date: SystemTime,
+    /// How long it holds; `None` = for ever.
+    pub valid: Option<Duration>,
+}
+
+impl Calibrated {
+    /// The time at which it ran out, where it has at `now`.
+    pub fn overdue(&self, now: SystemTime) -> Option<SystemTime> {
+        let until = self.date.checked_add(self.valid?)?;
+        (now > until).then_some(until)
+    }
 }
 
 /// A checked probe.
@@ -65,6 +84,8 @@ pub struct ProbeConfig {
     pub tip_radius_mm: f64,
     /// Standard uncertainty of one touch, mm.
     pub u_touch_mm: f64,
+    /// When these were found; `None` where nobody says.
+    pub calibrated: Option<Calibrated>,
     /// What it touches before a scan.
     pub touches: Vec<PlannedTouch>,
 }
@@ -320,7 +341,7 @@ impl Checker<'_> {
         let driver = device.needed("driver", "the word of a driver", Keys::text);
         let calibration = device
             .contains("calibration")
-            .then(|| pose(&mut device, "calibration"));
+            .then(|| calibration(&mut device, "calibration"));
         let tip = device.table("tip");
         let touches = device.tables("touch");
         let place = name
@@ -349,24 +370,29 @@ impl Checker<'_> {
         let touches: Vec<PlannedTouch> = touches.collect();
         let (name, setup) = (name?, setup?);
         match (calibration, tip) {
-            (Some(machine_from_sensor), None) => {
+            (Some(found), None) => {
+                let (machine_from_sensor, calibrated) = found?;
                 let calibration = Calibration {
-                    machine_from_sensor: machine_from_sensor?,
+                    machine_from_sensor,
                     travel_mm_per_count,
                 };
                 Some(DeviceConfig::Profiler(ProfilerConfig {
                     name,
                     setup,
                     calibration,
+                    calibrated,
                 }))
             }
-            (None, Some((tip_radius_mm, u_touch_mm))) => Some(DeviceConfig::Probe(ProbeConfig {
-                name,
-                setup,
-                tip_radius_mm,
-                u_touch_mm,
-                touches,
-            })),
+            (None, Some((tip_radius_mm, u_touch_mm, calibrated))) => {
+                Some(DeviceConfig::Probe(ProbeConfig {
+                    name,
+                    setup,
+                    tip_radius_mm,
+                    u_touch_mm,
+                    calibrated,
+                    touches,
+                }))
+            }
             _ => None,
         }
     }
@@ -397,8 +423,14 @@ impl Checker<'_> {
             .ok()
     }
 
-    fn tip(&mut self, at: &[&str], place: &str, table: toml::Table) -> Option<(f64, f64)> {
+    fn tip(
+        &mut self,
+        at: &[&str],
+        place: &str,
+        table: toml::Table,
+    ) -> Option<(f64, f64, Option<Calibrated>)> {
         let mut tip = Keys::new(table);
+        let calibrated = calibrated(&mut tip);
         let radius_mm = tip.needed("radius_mm", "a number, mm", |keys, key| {
             keys.number(key, 0.05..=25.0)
         });
@@ -407,7 +439,7 @@ impl Checker<'_> {
         });
         let path: Vec<&str> = at.iter().copied().chain(["tip"]).collect();
         self.add_all(&path, &format!("{place}, tip"), problems(tip));
-        Some((radius_mm?, u_touch_mm?))
+        Some((radius_mm?, u_touch_mm?, calibrated))
     }
 
     fn touch(

@@ -1,9 +1,12 @@
 //! What a cell's tables hold beyond a driver's: poses; and the lines on which keys stand.
 
+use std::time::Duration;
+
 use acies_drivers::settings::Keys;
 use glam::{DMat3, DVec3};
 use toml::de::{DeTable, DeValue};
 
+use super::Calibrated;
 use crate::geometry::RigidTransform;
 
 /// How far written axes may be from orthonormal: nine digits are written, six are asked for.
@@ -11,7 +14,46 @@ const AXES_TOLERANCE: f64 = 1e-6;
 
 /// A pose under `key`: `origin_mm`, and the directions `x_axis` and `z_axis`, all in the machine's axes.
 pub(super) fn pose(keys: &mut Keys, key: &'static str) -> Option<RigidTransform> {
-    let mut pose = Keys::new(keys.table(key)?);
+    let pose = Keys::new(keys.table(key)?);
+    adopt_pose(keys, key, pose)
+}
+
+/// A pose as in [`pose`], with `date` and `valid_days` of the calibration that found it.
+pub(super) fn calibration(
+    keys: &mut Keys,
+    key: &'static str,
+) -> Option<(RigidTransform, Option<Calibrated>)> {
+    let mut table = Keys::new(keys.table(key)?);
+    let calibrated = calibrated(&mut table);
+    adopt_pose(keys, key, table).map(|pose| (pose, calibrated))
+}
+
+/// `date` and `valid_days`: when the calibration was made and how long it holds; without `valid_days` for ever.
+pub(super) fn calibrated(keys: &mut Keys) -> Option<Calibrated> {
+    let expected = "a time as in \"2026-11-26T08:30:00Z\"";
+    let date = keys.read("date", expected, |value| {
+        let text = match value {
+            toml::Value::String(text) => text.clone(),
+            toml::Value::Datetime(date) => date.to_string(),
+            _ => return None,
+        };
+        humantime::parse_rfc3339_weak(&text).ok()
+    });
+    let valid_days = keys.number("valid_days", 0.01..=36_500.0);
+    if valid_days.is_some() && !keys.contains("date") && date.is_none() {
+        keys.wrong(
+            "date",
+            "nothing",
+            "the time of the calibration beside valid_days",
+        );
+    }
+    Some(Calibrated {
+        date: date?,
+        valid: valid_days.map(|days| Duration::from_secs_f64(86_400.0 * days)),
+    })
+}
+
+fn adopt_pose(keys: &mut Keys, key: &'static str, mut pose: Keys) -> Option<RigidTransform> {
     let origin_mm = vector(&mut pose, "origin_mm");
     let x = vector(&mut pose, "x_axis");
     let z = vector(&mut pose, "z_axis");

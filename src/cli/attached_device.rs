@@ -1,0 +1,168 @@
+//! What the commands share that take one device of a cell in hand: finding it, running it, saying what came.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use acies_drivers::capture::Profile;
+use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Setup};
+use acies_drivers::link::Links;
+use anyhow::anyhow;
+
+use super::Failure;
+use crate::acquire::Calibration;
+use crate::config::Cell;
+
+/// A device of a cell's configuration.
+pub struct Configured<'a> {
+    /// Ready to open.
+    pub setup: &'a dyn Setup,
+    /// Where a profiler is; `None` for a probe.
+    pub calibration: Option<Calibration>,
+}
+
+/// Reads the cell and finds the device called `name`, or the only one there is.
+pub fn read_cell(path: &Path) -> Result<Cell, Failure> {
+    Cell::read(path).map_err(|errors| Failure::BadInput(anyhow!("{errors}")))
+}
+
+/// The device called `name`; without a name the only one of the cell.
+pub fn find<'a>(cell: &'a Cell, name: Option<&str>) -> Result<Configured<'a>, Failure> {
+    let profilers = cell.profilers.iter().map(|p| {
+        let configured = Configured {
+            setup: &*p.setup,
+            calibration: Some(p.calibration),
+        };
+        (p.name.as_str(), configured)
+    });
+    let probes = cell.probes.iter().map(|p| {
+        let configured = Configured {
+            setup: &*p.setup,
+            calibration: None,
+        };
+        (p.name.as_str(), configured)
+    });
+    let mut all: Vec<(&str, Configured<'a>)> = profilers.chain(probes).collect();
+    let names: Vec<String> = all.iter().map(|(n, _)| format!("{n:?}")).collect();
+    let place = match name {
+        Some(name) => all.iter().position(|(n, _)| *n == name),
+        None if all.len() == 1 => Some(0),
+        None => None,
+    };
+    match place {
+        Some(place) => Ok(all.swap_remove(place).1),
+        None => Err(Failure::Usage(anyhow!(
+            "--device: {}, expected one of {}",
+            name.map_or_else(|| "nothing".to_owned(), |name| format!("{name:?}")),
+            names.join(", ")
+        ))),
+    }
+}
+
+/// Opens it.
+pub fn open(configured: &Configured<'_>, links: &dyn Links) -> Result<Instrument, Failure> {
+    configured
+        .setup
+        .open(links)
+        .map_err(|error| Failure::Io(error.into()))
+}
+
+/// What a run of a profiler brought.
+pub struct Run {
+    /// In the order of receipt.
+    pub profiles: Vec<Profile>,
+    /// What was lost.
+    pub losses: Losses,
+    /// Why it ended before it should, where it did.
+    pub ended: Option<String>,
+}
+
+/// Most profiles kept of one run: an hour at a kilohertz, some 30 GB of the largest; a run by hand is seconds.
+const PROFILES_MAX: usize = 3_600_000;
+
+/// Runs `profiler` until it has sent `count` profiles, `limit` has passed, or it is silent for `silence` or gone.
+pub fn run(
+    profiler: &mut dyn Profiler,
+    count: usize,
+    limit: Duration,
+    silence: Duration,
+) -> Result<Run, Failure> {
+    profiler
+        .start()
+        .map_err(|error| Failure::Io(error.into()))?;
+    let (began, mut heard) = (Instant::now(), Instant::now());
+    let mut run = Run {
+        profiles: Vec::new(),
+        losses: Losses::default(),
+        ended: None,
+    };
+    while run.profiles.len() < count.min(PROFILES_MAX) && began.elapsed() < limit {
+        match profiler.next(Instant::now() + Duration::from_millis(100)) {
+            Ok(Some(profile)) => {
+                heard = Instant::now();
+                run.profiles.push(profile);
+            }
+            Ok(None) if heard.elapsed() > silence => {
+                run.ended = Some(format!("silent for {:.1} s", silence.as_secs_f64()));
+                break;
+            }
+            Ok(None) => {}
+            Err(error) => {
+                run.ended = Some(error.to_string());
+                break;
+            }
+        }
+    }
+    match profiler.stop() {
+        Ok(under_way) => run.profiles.extend(under_way),
+        Err(error) if run.ended.is_none() => run.ended = Some(error.to_string()),
+        Err(_) => {}
+    }
+    run.losses = profiler.losses();
+    Ok(run)
+}
+
+/// One line that names a device.
+pub fn named(identity: &Identity) -> String {
+    let Identity {
+        vendor,
+        model,
+        serial,
+        firmware,
+    } = identity;
+    let serial = if serial.is_empty() { "none" } else { serial };
+    format!("{vendor} {model}, serial number {serial}, firmware {firmware}")
+}
+
+/// A run in a few lines: counts, losses, encoder, range.
+pub fn summary(run: &Run) -> String {
+    let points = |profile: &Profile| profile.z_mm.iter().filter(|z| z.is_finite()).count();
+    let total: usize = run.profiles.iter().map(points).sum();
+    let z = || {
+        let all = run.profiles.iter().flat_map(|p| p.z_mm.iter().copied());
+        all.filter(|z| z.is_finite())
+    };
+    let Losses {
+        received,
+        lost_on_link,
+        dropped_by_device,
+        rejected,
+        skipped_bytes,
+    } = run.losses;
+    let mut lines = vec![format!(
+        "{received} profiles, {total} points; lost on the link {lost_on_link}, dropped by the device {dropped_by_device}, rejected {rejected}, \
+         bytes skipped {skipped_bytes}"
+    )];
+    if total > 0 {
+        let (low, high) = z().fold((f64::MAX, f64::MIN), |(l, h), z| (l.min(z), h.max(z)));
+        lines.push(format!("z from {low:.3} to {high:.3} mm"));
+    }
+    let mut encoders = run.profiles.iter().filter_map(|p| p.encoder);
+    if let Some(first) = encoders.next() {
+        let last = encoders.next_back().unwrap_or(first);
+        lines.push(format!("encoder from {first} to {last}"));
+    }
+    if let Some(ended) = &run.ended {
+        lines.push(format!("ended early: {ended}"));
+    }
+    lines.join("\n")
+}

@@ -1,0 +1,64 @@
+//! `acies replay CELL.toml RECORDING`: a recording through the same driver, as if the device were there.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use acies_drivers::device::Instrument;
+use acies_drivers::link::recording::Recording;
+use acies_drivers::link::replay::{Match, Replay};
+
+use super::attached_device::{find, named, open, read_cell, run, summary};
+use super::{Failure, Status, print_line};
+use crate::acquire::Assembler;
+use crate::points::write_scan;
+
+/// Plays a recording back through the driver of one device, and says what it holds; the points go into a PLY file if asked.
+#[derive(Debug, clap::Args)]
+pub struct ReplayCommand {
+    /// The cell's configuration that the recording was made with.
+    cell: PathBuf,
+    /// The recording, as `acies record` writes it.
+    recording: PathBuf,
+    /// Which device, by its name in the configuration; needed where there are several.
+    #[arg(long, value_name = "NAME")]
+    device: Option<String>,
+    /// Write the points, placed by encoder and calibration in the machine's axes, as PLY.
+    #[arg(short, long, value_name = "OUT.ply")]
+    output: Option<PathBuf>,
+}
+
+/// A driver that writes at other moments than it did when recorded is waited for no longer than this.
+const PATIENCE: Duration = Duration::from_millis(20);
+
+impl ReplayCommand {
+    /// Carries the command out.
+    ///
+    /// # Errors
+    /// Bad input where configuration or recording cannot be understood; input or output where a file cannot be written.
+    pub fn run(self) -> Result<Status, Failure> {
+        let cell = read_cell(&self.cell)?;
+        let device = find(&cell, self.device.as_deref())?;
+        let recording =
+            Recording::read(&self.recording).map_err(|error| Failure::BadInput(error.into()))?;
+        let links = Replay::new(recording, Match::Loose(PATIENCE));
+        match open(&device, &links)? {
+            Instrument::Profiler(mut profiler) => {
+                print_line(&named(profiler.identity()))?;
+                let hour = Duration::from_secs(3600);
+                let run = run(profiler.as_mut(), usize::MAX, hour, Duration::from_secs(1))?;
+                print_line(&summary(&run))?;
+                if let (Some(path), Some(calibration)) = (&self.output, device.calibration) {
+                    let mut assembler = Assembler::new("replay", calibration);
+                    run.profiles.iter().for_each(|p| assembler.push(p));
+                    let (cloud, findings) = assembler.finish();
+                    for finding in findings {
+                        print_line(&finding)?;
+                    }
+                    write_scan(path, &cloud).map_err(|error| Failure::Io(error.into()))?;
+                }
+            }
+            Instrument::Probe(probe) => print_line(&named(probe.identity()))?,
+        }
+        Ok(Status::Done)
+    }
+}
