@@ -190,3 +190,36 @@ fn text_that_is_no_toml_is_told_with_its_line() {
         "/nowhere/cell.toml: file: No such file or directory (os error 2), expected a readable TOML file"
     );
 }
+
+#[test]
+fn a_calibration_has_a_date_and_runs_out() {
+    use std::time::{Duration, SystemTime};
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo/cell.toml");
+    let text = std::fs::read_to_string(&path).expect("the demo's cell");
+    let with = |added: &str| {
+        let text = text.replacen(
+            "[device.calibration]",
+            &format!("[device.calibration]\n{added}"),
+            1,
+        );
+        acies::config::Cell::parse(&text, &path)
+    };
+    let cell = with("date = 2026-01-31T12:00:00Z\nvalid_days = 10").expect("a sound cell");
+    let left = cell.profilers[0].calibrated.expect("it has a date");
+    // 2026-01-31 12:00 UTC, by the calendar: 20484 days and a half after 1970.
+    let made = SystemTime::UNIX_EPOCH + Duration::from_secs(20_484 * 86_400 + 43_200);
+    let day = Duration::from_secs(86_400);
+    assert_eq!(left.date, made);
+    assert_eq!(left.overdue(made + 9 * day), None);
+    assert_eq!(left.overdue(made + 11 * day), Some(made + 10 * day));
+    assert_eq!(cell.profilers[1].calibrated, None);
+    let undated = with("valid_days = 10").expect_err("no date");
+    assert!(
+        undated
+            .to_string()
+            .contains("the time of the calibration beside valid_days"),
+        "{undated}"
+    );
+    let nonsense = with("date = \"yesterday\"").expect_err("no time");
+    assert!(nonsense.to_string().contains("a time as in"), "{nonsense}");
+}

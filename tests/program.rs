@@ -367,3 +367,87 @@ fn devices_and_check_answer_in_json() {
     assert_eq!(status(&acies(&["chekc"])), 64);
     assert_eq!(status(&acies(&["--help"])), 0);
 }
+
+/// The left profiler of the demo's cell, played under a port of a copy of its configuration.
+fn left_profiler(name: &str) -> (PathBuf, acies_simulators::devices::Simulated) {
+    let folder = folder(name);
+    let demo = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
+    for file in ["cell.toml", "recipe.toml", "part.step"] {
+        fs::copy(demo.join(file), folder.join(file)).expect("a copy of the demo's files");
+    }
+    fs::create_dir_all(folder.join("dev")).expect("a folder for the port");
+    let place = acies_simulators::devices::Place::Pty(folder.join("dev/ttyLEFT"));
+    let device = acies_simulators::devices::start("open-profile", &place, 5, "");
+    (folder, device.expect("the simulated profiler starts"))
+}
+
+#[test]
+fn a_device_is_tried_by_hand_recorded_and_played_back() {
+    let (folder, device) = left_profiler("by-hand");
+    let cell = folder.join("cell.toml").display().to_string();
+    let tried = acies(&["probe", &cell, "--device", "left", "--profiles", "5"]);
+    assert_eq!(status(&tried), 0, "{}", text(&tried.stderr));
+    assert!(text(&tried.stdout).contains("serial number SIM-LEFT"));
+    let output = folder.join("recorded");
+    let recorded = acies(&[
+        "record",
+        &cell,
+        "--device",
+        "left",
+        "--profiles",
+        "40",
+        "-o",
+        &output.display().to_string(),
+    ]);
+    assert_eq!(status(&recorded), 0, "{}", text(&recorded.stderr));
+    let said = text(&recorded.stdout);
+    assert!(said.contains("lost on the link 0,"), "{said}");
+    // From here on nobody answers: the recording does.
+    drop(device);
+    let file = fs::read_dir(&output)
+        .expect("the folder was made")
+        .map(|entry| entry.expect("an entry").path())
+        .next()
+        .expect("one recording");
+    let points = folder.join("points.ply");
+    let replayed = acies(&[
+        "replay",
+        &cell,
+        &file.display().to_string(),
+        "--device",
+        "left",
+        "-o",
+        &points.display().to_string(),
+    ]);
+    assert_eq!(status(&replayed), 0, "{}", text(&replayed.stderr));
+    let counted = |output: &str| output.lines().nth(1).map(str::to_owned);
+    assert_eq!(
+        counted(&text(&replayed.stdout)),
+        counted(&said),
+        "what was recorded is what is played"
+    );
+    let detected = acies(&["detect", &points.display().to_string(), "--json"]);
+    assert_eq!(status(&detected), 0, "{}", text(&detected.stderr));
+
+    let nobody = acies(&["probe", &cell, "--device", "middle"]);
+    assert_eq!(status(&nobody), 64);
+    assert!(
+        text(&nobody.stderr).contains("\"middle\", expected one of \"left\", \"right\", \"probe\"")
+    );
+    let no_sphere = acies(&[
+        "calibrate",
+        &cell,
+        "--device",
+        "left",
+        "--radius",
+        "12.7",
+        "--sphere",
+        &format!("{}=1,2,3", file.display()),
+    ]);
+    assert_eq!(status(&no_sphere), 65);
+    assert!(
+        text(&no_sphere.stderr).contains("no sphere of radius 12.7 mm"),
+        "{}",
+        text(&no_sphere.stderr)
+    );
+}
