@@ -5,6 +5,8 @@
 pub mod acceptance;
 mod assembler;
 pub mod calibrate;
+pub mod clock;
+pub mod poses;
 mod run;
 
 use glam::DVec3;
