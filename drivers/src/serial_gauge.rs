@@ -238,6 +238,7 @@ impl Setup for Settings {
                 firmware: String::new(),
             },
             heard_bytes: 0,
+            fresh: false,
             run: None,
             account: Losses::default(),
             settings: self.clone(),
@@ -255,6 +256,8 @@ struct Gauge {
     assembler: Assembler,
     identity: Identity,
     heard_bytes: u64,
+    /// It said that it has just been switched on.
+    fresh: bool,
     run: Option<Run>,
     account: Losses,
     settings: Settings,
@@ -299,12 +302,13 @@ impl Gauge {
                 })?;
             self.heard_bytes += n as u64;
             let dialect = self.settings.dialect;
-            let account = &mut self.account;
+            let (account, fresh) = (&mut self.account, &mut self.fresh);
             self.assembler.take(&buffer[..n], |text| {
                 let (text, event) = match text {
                     Ok(text) => (text, line(dialect, text)),
                     Err(error) => ("", Err(error)),
                 };
+                *fresh |= event == Ok(Line::SwitchedOn);
                 if answer.is_none() {
                     answer = each(text, event);
                 } else {
@@ -322,17 +326,16 @@ impl Gauge {
         }
     }
 
-    /// Takes in what lies there unasked: a button, or the answer to a question that was given up.
-    fn drain(&mut self) -> Result<(), DeviceError> {
+    /// Takes in what comes unasked until `deadline`: a button, or the answer to a question that was given up.
+    fn drain(&mut self, deadline: Instant) -> Result<(), DeviceError> {
         let mut skipped = 0;
-        let on = self.read(Instant::now(), |text, event| {
+        self.read(deadline, |text, _| {
             skipped += text.len() as u64;
-            (event == Ok(Line::SwitchedOn)).then_some(())
+            None::<()>
         })?;
-        skipped += self.assembler.forget() as u64;
         self.account.skipped_bytes += skipped;
-        match on {
-            Some(()) if self.run.is_some() => Err(self.switched_on()),
+        match self.run {
+            Some(_) if self.fresh => Err(self.switched_on()),
             _ => Ok(()),
         }
     }
@@ -347,7 +350,7 @@ impl Gauge {
 
     /// Asks who it is where it can tell, and for one reading: that proves line, dialect and number of channels.
     fn introduce(&mut self) -> Result<(), DeviceError> {
-        self.drain()?;
+        self.drain(Instant::now())?;
         if self.settings.dialect == Dialect::SylvacOptoRs {
             let text = self.settled("ID?\r", |text, event| match event {
                 Ok(Line::Aside(_)) => Some(Ok(text.to_owned())),
@@ -400,7 +403,8 @@ impl Gauge {
     ) -> Result<T, DeviceError> {
         let heard_before = self.heard_bytes;
         for _ in 0..TRIES {
-            self.drain()?;
+            self.drain(Instant::now())?;
+            self.assembler.forget();
             self.write(question)?;
             match self.read(Instant::now() + REPLY, &mut each)? {
                 Some(Ok(answer)) => return Ok(answer),
@@ -456,22 +460,22 @@ impl Gauge {
         let mut z_mm = vec![f64::NAN; n];
         let mut answered = vec![false; n];
         for channel in 0..self.settings.dialect.questions(n) {
-            self.drain()?;
-            self.write(&self.question(channel))?;
+            self.drain(Instant::now())?;
+            self.account.skipped_bytes += self.assembler.forget() as u64;
+            let question = self.question(channel);
+            self.write(&question)?;
             let deadline = Instant::now() + self.settings.reply;
             let mut rejected = 0;
-            let mut on = false;
-            let answer = self.read(deadline, |_, event| match event {
+            let answer = self.read(deadline, |text, event| match event {
+                // A Sylvac repeats what it is sent.
+                _ if text == question.trim_end() => None,
                 Ok(Line::One(found, reading)) if found == channel => Some(vec![(channel, reading)]),
                 // The error line names no channel.
                 Ok(Line::One(0, reading @ Reading::Absent(_))) => Some(vec![(channel, reading)]),
                 Ok(Line::All(readings)) if readings.len() == n => {
                     Some(readings.into_iter().enumerate().collect())
                 }
-                Ok(Line::SwitchedOn) => {
-                    on = true;
-                    Some(Vec::new())
-                }
+                Ok(Line::SwitchedOn) => Some(Vec::new()),
                 // Asked for something it could not do now: no value, and no need to wait.
                 Ok(Line::Refused(_)) => Some(Vec::new()),
                 Ok(Line::Aside(_)) => None,
@@ -485,7 +489,7 @@ impl Gauge {
                 }
             })?;
             self.account.rejected += rejected;
-            if on {
+            if self.fresh {
                 return Err(self.switched_on());
             }
             for (channel, reading) in answer.unwrap_or_default() {
@@ -560,6 +564,7 @@ impl Profiler for Gauge {
             let _ = self.laser(false);
             return Err(error);
         }
+        self.fresh = false;
         self.run = Some(Run {
             due: Instant::now(),
             number: 0,
@@ -575,15 +580,7 @@ impl Profiler for Gauge {
         };
         let due = run.due;
         // What comes unasked is a button; the end of the link shows here too.
-        let mut skipped = 0;
-        let on = self.read(due.min(deadline), |text, event| {
-            skipped += text.len() as u64;
-            (event == Ok(Line::SwitchedOn)).then_some(())
-        })?;
-        self.account.skipped_bytes += skipped;
-        if on.is_some() {
-            return Err(self.switched_on());
-        }
+        self.drain(due.min(deadline))?;
         if due > deadline {
             return Ok(None);
         }

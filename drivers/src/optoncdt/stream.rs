@@ -27,7 +27,7 @@ pub struct Word {
     pub first: bool,
     /// The value.
     pub value: u32,
-    /// Nothing stood between it and the word or reply before.
+    /// No byte was thrown away between it and the word or reply before.
     pub clean: bool,
 }
 
@@ -37,6 +37,8 @@ pub struct Decoder {
     /// Bytes without bit 7 since the last word or reply.
     pending: Vec<u8>,
     skipped_bytes: u64,
+    /// As it stood at the last word or reply.
+    skipped_before: u64,
 }
 
 fn is_low(byte: u8) -> bool {
@@ -67,7 +69,9 @@ impl Decoder {
                     && is_middle(*middle)
                     && *high & 0x80 != 0
                 {
-                    each(Item::Word(word(*low, *middle, *high, true)));
+                    let clean = self.skipped_bytes == self.skipped_before;
+                    self.skipped_before = self.skipped_bytes;
+                    each(Item::Word(word(*low, *middle, *high, clean)));
                     rest = more;
                 }
             }
@@ -84,6 +88,7 @@ impl Decoder {
         if byte & 0x80 == 0 {
             self.pending.push(byte);
             if self.pending.ends_with(b"->") {
+                self.skipped_before = self.skipped_bytes;
                 each(Item::Reply(&self.pending[..n - 1]));
                 self.pending.clear();
             } else if n + 1 == TEXT_MAX {
@@ -98,7 +103,9 @@ impl Decoder {
         match self.pending[..] {
             [.., low, middle] if is_low(low) && is_middle(middle) && n <= EXPLAINED => {
                 self.skipped_bytes += n as u64 - 2;
-                each(Item::Word(word(low, middle, byte, n == 2)));
+                let clean = self.skipped_bytes == self.skipped_before;
+                self.skipped_before = self.skipped_bytes;
+                each(Item::Word(word(low, middle, byte, clean)));
             }
             _ => self.skipped_bytes += n as u64 + 1,
         }
@@ -129,7 +136,7 @@ pub struct Assembly {
     misfits: u32,
     /// Measurements thrown away because values are missing or in doubt.
     pub rejected: u64,
-    /// Of these, whole ones behind a place where words may have been spliced.
+    /// Of these, whole ones that may have been put together from two.
     pub doubted: u64,
 }
 
@@ -153,7 +160,8 @@ impl Assembly {
     /// Takes a word; the values of the measurement that it completes, in order.
     ///
     /// Where the last word of a measurement is missing and the next one follows without a break, the two may be one word of
-    /// halves: low bytes of the old, high byte of the new. The measurement that begins so is thrown away.
+    /// halves: low bytes of the old, high byte of the new. The measurement that begins so is thrown away. So is one with rubbish
+    /// inside: the rubbish may have been its true beginning.
     pub fn take(&mut self, word: Word) -> Option<&[u32]> {
         if word.first {
             let missing = self.values.saturating_sub(self.seen);
@@ -169,6 +177,8 @@ impl Assembly {
             self.seen = 0;
         } else if self.seen == 0 {
             return None;
+        } else {
+            self.doubtful |= !word.clean;
         }
         self.seen = self.seen.saturating_add(1);
         if self.seen > self.values {
@@ -298,6 +308,26 @@ mod tests {
         });
         assert_eq!(found, [[1002, 2]]);
         assert_eq!((assembly.rejected, assembly.doubted), (2, 1));
+    }
+
+    #[test]
+    fn rubbish_that_looks_like_a_distance_gets_no_counter() {
+        let mut bytes = [encode(true, 1000), encode(false, 0)].concat();
+        // A value out of nowhere, and so much before the next word that this is given up.
+        bytes.extend(encode(true, 5555));
+        bytes.extend([1; 9]);
+        bytes.extend([encode(true, 1001), encode(false, 1)].concat());
+        let mut decoder = Decoder::default();
+        let mut assembly = Assembly::new(2);
+        let mut found = Vec::new();
+        decoder.take(&bytes, |item| {
+            if let Item::Word(word) = item
+                && let Some(values) = assembly.take(word)
+            {
+                found.push(values.to_vec());
+            }
+        });
+        assert_eq!(found, [[1000, 0]]);
     }
 
     #[test]
