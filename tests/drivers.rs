@@ -19,6 +19,8 @@ use acies_simulators::grbl::SimulatedProbe;
 use acies_simulators::open_profile::{Fate, SimulatedProfiler};
 use acies_simulators::wire::Wire;
 
+#[path = "drivers/accounts.rs"]
+mod accounts;
 #[path = "drivers/bench.rs"]
 mod bench;
 #[path = "drivers/conformance.rs"]
@@ -157,7 +159,10 @@ fn losses_on_a_bad_line_are_exact() {
 
 #[test]
 fn losses_under_every_fault_of_framing_are_exact() {
-    losses_are_exact("lie=0.02,babble=0.05,duplicate=0.03,split", "framing");
+    losses_are_exact(
+        "lie=0.02,babble=0.05,duplicate=0.03,split,truncated,encoder-jitter,clock-drift",
+        "framing",
+    );
 }
 
 #[test]
@@ -203,6 +208,27 @@ fn the_same_device_over_tcp() {
     let profiles = scan(profiler.as_mut(), 100).expect("a scan");
     assert_eq!(profiles.len(), device.status().sent as usize);
     drop(profiler);
+    assert!(!device.status().laser_on);
+}
+
+#[test]
+fn serial_sensors_over_tcp_as_behind_a_serial_server() {
+    let setup = acies_simulators::rf60x::Setup {
+        faults: "latency-lumps,split".parse().expect("the test's faults"),
+        ..acies_simulators::rf60x::Setup::new(&[17_185], 4)
+    };
+    let address: SocketAddr = "127.0.0.1:0".parse().expect("an address");
+    let wire = Wire::tcp(address).expect("a listener");
+    let device = acies_simulators::rf60x::start(wire, setup).expect("a device");
+    let link = format!("address = {:?}", device.port());
+    let opened = open(&*bench_of("rf60x").setup(&link, ""), &Cable);
+    let Instrument::Profiler(mut sensor) = opened else {
+        panic!("no profiler");
+    };
+    let profiles = scan(sensor.as_mut(), 100).expect("a scan");
+    assert_eq!(profiles.len(), device.truth().values.len());
+    assert_eq!(sensor.losses().lost_on_link, 0);
+    drop(sensor);
     assert!(!device.status().laser_on);
 }
 

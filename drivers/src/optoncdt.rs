@@ -36,7 +36,9 @@
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Mistake, Profiler, Setup,
+};
 use crate::error::{DecodeError, DeviceError};
 use crate::link::pump::{Chunk, Pump};
 use crate::link::{Links, Target};
@@ -118,6 +120,10 @@ struct Settings {
 }
 
 fn configure(table: toml::Table) -> Configured {
+    Ok(Box::new(settings(table)?))
+}
+
+fn settings(table: toml::Table) -> Result<Settings, Vec<Mistake>> {
     const SCALES: [(&str, Scale); 3] = [
         ("ild1420", Scale::Ild1420),
         ("ild1900", Scale::Ild1900),
@@ -149,7 +155,7 @@ fn configure(table: toml::Table) -> Configured {
     };
     keys.finish()?;
     match target {
-        Some(target) => Ok(Box::new(Settings { target, ..settings })),
+        Some(target) => Ok(Settings { target, ..settings }),
         // Without a mistake there is a target: `finish` has returned otherwise.
         None => Err(Vec::new()),
     }
@@ -344,17 +350,24 @@ impl Run {
             self.damaged += 1;
             return;
         }
-        let mut believed = Vec::new();
+        // A value that was held and the one that confirms it.
+        let mut believed = [None; 2];
         match counter {
-            Some(counter) => self
-                .sequencer
-                .take(counter, host_time, measured, |n, m| believed.push((n, m))),
+            Some(counter) => {
+                let mut places = believed.iter_mut();
+                self.sequencer
+                    .take(counter, host_time, measured, |number, measured| {
+                        if let Some(place) = places.next() {
+                            *place = Some((number, measured));
+                        }
+                    });
+            }
             None => {
-                believed.push((self.counted, measured));
+                believed[0] = Some((self.counted, measured));
                 self.counted += 1;
             }
         }
-        for (number, measured) in believed {
+        for (number, measured) in believed.into_iter().flatten() {
             self.believe(number, measured);
         }
     }
@@ -400,6 +413,56 @@ impl Run {
             skipped_bytes,
             ..self.rows.losses
         }
+    }
+}
+
+/// The stream alone, without commands: bytes to profiles, for whoever has a recording of it.
+pub struct Stream {
+    decoder: Decoder,
+    run: Run,
+}
+
+impl Stream {
+    /// A stream as the driver configured by `table` reads it, from a sensor with this range.
+    ///
+    /// # Errors
+    /// The mistakes of the table.
+    pub fn new(table: toml::Table, range_mm: f64) -> Result<Stream, Vec<Mistake>> {
+        let settings = settings(table)?;
+        Ok(Stream {
+            decoder: Decoder::default(),
+            run: Run::new(&settings, range_mm),
+        })
+    }
+
+    /// Takes bytes that came at a time.
+    pub fn take(&mut self, bytes: &[u8], at: Instant) {
+        let run = &mut self.run;
+        self.decoder.take(bytes, |item| {
+            if let Item::Word(word) = item {
+                run.word(word, at);
+            }
+        });
+    }
+
+    /// The oldest profile.
+    pub fn pop(&mut self) -> Option<Profile> {
+        self.run.rows.pop()
+    }
+
+    /// The end of the stream.
+    pub fn finish(&mut self) {
+        self.run.finish();
+    }
+
+    /// What was lost.
+    pub fn losses(&self) -> Losses {
+        self.run.losses(self.decoder.skipped_bytes())
+    }
+
+    /// Measurements that were thrown away because they may have been put together from two, or from rubbish.
+    pub fn doubted(&self) -> u64 {
+        self.run.assembly.doubted + self.decoder.doubted()
     }
 }
 

@@ -311,7 +311,7 @@ struct Rounds {
 }
 
 enum Run {
-    Stream(Stream, Instant),
+    Stream(Box<Stream>, Instant),
     Rounds(Rounds),
 }
 
@@ -560,7 +560,7 @@ impl Bus {
         stream.skipped_before = self.decoder.skipped_bytes();
         stream.count.begin(self.decoder.skipped_bytes());
         self.start_stream()?;
-        Ok(Run::Stream(stream, Instant::now()))
+        Ok(Run::Stream(Box::new(stream), Instant::now()))
     }
 
     fn start_stream(&mut self) -> Result<(), DeviceError> {

@@ -39,6 +39,7 @@ pub struct Decoder {
     skipped_bytes: u64,
     /// As it stood at the last word or reply.
     skipped_before: u64,
+    doubted: u64,
 }
 
 fn is_low(byte: u8) -> bool {
@@ -107,6 +108,10 @@ impl Decoder {
                 self.skipped_before = self.skipped_bytes;
                 each(Item::Word(word(low, middle, byte, clean)));
             }
+            [.., low, middle] if is_low(low) && is_middle(middle) => {
+                self.doubted += 1;
+                self.skipped_bytes += n as u64 + 1;
+            }
             _ => self.skipped_bytes += n as u64 + 1,
         }
         self.pending.clear();
@@ -115,6 +120,11 @@ impl Decoder {
     /// Bytes thrown away.
     pub fn skipped_bytes(&self) -> u64 {
         self.skipped_bytes
+    }
+
+    /// Words thrown away because rubbish stood before them.
+    pub fn doubted(&self) -> u64 {
+        self.doubted
     }
 
     /// Bytes kept for later.

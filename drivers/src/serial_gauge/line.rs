@@ -153,8 +153,8 @@ fn heidenhain(text: &str) -> Option<Line> {
         "\x15" => return Some(Line::Refused("NAK".into())),
         _ => {}
     }
-    if text.starts_with('\x02') {
-        return Some(Line::Aside(text[1..].trim().to_owned()));
+    if let Some(said) = text.strip_prefix('\x02') {
+        return Some(Line::Aside(said.trim().to_owned()));
     }
     if let [axis, b'='] = text.as_bytes().get(..2)?
         && axis.is_ascii_uppercase()
