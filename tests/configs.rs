@@ -223,3 +223,40 @@ fn a_calibration_has_a_date_and_runs_out() {
     let nonsense = with("date = \"yesterday\"").expect_err("no time");
     assert!(nonsense.to_string().contains("a time as in"), "{nonsense}");
 }
+
+/// The examples that stand in `configs/` for one driver each, with the devices of their tables simulated under the same names.
+#[test]
+fn every_example_of_a_driver_opens_its_simulated_devices() {
+    use acies_drivers::device::Instrument;
+    use acies_drivers::link::cable::Cable;
+    use acies_simulators::devices::{self, Place};
+
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+    let here = Path::new(env!("CARGO_TARGET_TMPDIR")).join("examples");
+    std::fs::create_dir_all(here.join("demo")).expect("a folder");
+    std::fs::copy(configs.join("demo/part.step"), here.join("demo/part.step")).expect("the part");
+    for name in ["optoncdt", "rf60x", "serial-gauge"] {
+        let folder = here.join(name);
+        std::fs::create_dir_all(folder.join("dev")).expect("a folder");
+        let file = folder.join("cell.toml");
+        std::fs::copy(configs.join(name).join("cell.toml"), &file).expect("the example");
+        let cell = Cell::read(&file).unwrap_or_else(|errors| panic!("{errors}"));
+        assert!(!cell.profilers.is_empty());
+        for profiler in &cell.profilers {
+            let claim = profiler.setup.claims()[0].to_string();
+            let port = claim.trim_start_matches("port ");
+            let device = devices::start(&profiler.name, &Place::Pty(port.into()), 1, "");
+            let device = device.expect("a simulated device");
+            assert_eq!(device.port(), port);
+            let opened = profiler.setup.open(&Cable);
+            let Ok(Instrument::Profiler(mut open)) = opened else {
+                panic!("{name}: {}: {:?}", profiler.name, opened.err());
+            };
+            open.start().expect("a start");
+            let soon = std::time::Instant::now() + std::time::Duration::from_secs(20);
+            let profile = open.next(soon).expect("a run").expect("a profile in time");
+            assert!(profile.z_mm.iter().any(|z| z.is_finite()), "{name}");
+            open.stop().expect("a stop");
+        }
+    }
+}

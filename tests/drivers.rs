@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use acies_drivers::ALL;
 use acies_drivers::capture::Profile;
-use acies_drivers::device::{Driver, Instrument, Probe, Profiler, Setup};
+use acies_drivers::device::{Instrument, Probe, Profiler, Setup};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
@@ -19,154 +19,14 @@ use acies_simulators::grbl::SimulatedProbe;
 use acies_simulators::open_profile::{Fate, SimulatedProfiler};
 use acies_simulators::wire::Wire;
 
-/// Longest wait for something that must happen; long because the machine may be busy.
-const SOON: Duration = Duration::from_secs(30);
+#[path = "drivers/accounts.rs"]
+mod accounts;
+#[path = "drivers/bench.rs"]
+mod bench;
+#[path = "drivers/conformance.rs"]
+mod conformance;
 
-/// A device at the other end of a wire.
-enum Simulated {
-    Profiler(SimulatedProfiler),
-    Probe(SimulatedProbe),
-}
-
-impl Simulated {
-    fn unplug(&self) {
-        match self {
-            Simulated::Profiler(device) => device.unplug(),
-            Simulated::Probe(device) => device.unplug(),
-        }
-    }
-
-    fn replug(&self) {
-        match self {
-            Simulated::Profiler(device) => device.replug(),
-            Simulated::Probe(device) => device.replug(),
-        }
-    }
-
-    /// No light comes out, now or within [`SOON`].
-    fn goes_dark(&self) -> bool {
-        match self {
-            Simulated::Profiler(device) => device.wait_until(SOON, |status| !status.laser_on),
-            Simulated::Probe(_) => true,
-        }
-    }
-}
-
-/// What the suite must know of one driver.
-struct Bench {
-    driver: &'static Driver,
-    /// Keys beside the link.
-    keys: &'static str,
-    /// A key that another device's identity makes wrong.
-    wrong: &'static str,
-    simulate: fn(&DemoCell, Wire) -> std::io::Result<Simulated>,
-}
-
-fn bench(driver: &'static Driver) -> Bench {
-    match driver.name {
-        "open-profile" => Bench {
-            driver,
-            keys: "columns = 64\nkeepalive_s = 0.2",
-            wrong: "serial_number = 'ANOTHER'",
-            simulate: |cell, wire| cell.start_profiler(0, wire).map(Simulated::Profiler),
-        },
-        "grbl-probe" => Bench {
-            driver,
-            keys: "safe_z_mm = 150\nfeed_mm_min = 300",
-            wrong: "build_info = 'ANOTHER'",
-            simulate: |cell, wire| cell.start_probe(wire).map(Simulated::Probe),
-        },
-        other => {
-            panic!("driver {other} has no simulator here: add one to simulators/ and to this list")
-        }
-    }
-}
-
-fn benches() -> Vec<Bench> {
-    ALL.iter().map(bench).collect()
-}
-
-/// Where a simulated port appears: a path of this test's own.
-fn port(test: &str, driver: &str) -> PathBuf {
-    let folder = Path::new(env!("CARGO_TARGET_TMPDIR"))
-        .join("drivers")
-        .join(test);
-    std::fs::create_dir_all(&folder).expect("a folder");
-    folder.join(driver)
-}
-
-impl Bench {
-    fn setup(&self, link: &str, more: &str) -> Box<dyn Setup> {
-        let table = format!("{link}\n{}\n{more}", self.keys);
-        let table = toml::from_str(&table).expect("the test's TOML");
-        (self.driver.configure)(table).unwrap_or_else(|mistakes| panic!("{mistakes:?}"))
-    }
-
-    fn start(&self, cell: &DemoCell, port: &Path) -> Simulated {
-        let wire = Wire::pty(port).expect("a pseudo-terminal");
-        (self.simulate)(cell, wire).expect("a simulated device")
-    }
-}
-
-fn by_port(port: &Path) -> String {
-    format!("port = {:?}", port.display().to_string())
-}
-
-fn text(error: &DeviceError) -> String {
-    let mut text = error.to_string();
-    let mut inner = std::error::Error::source(error);
-    while let Some(source) = inner {
-        text = format!("{text}: {source}");
-        inner = source.source();
-    }
-    text
-}
-
-fn refusal(setup: &dyn Setup) -> String {
-    match setup.open(&Cable) {
-        Ok(_) => panic!("it opened"),
-        Err(error) => text(&error),
-    }
-}
-
-fn open(setup: &dyn Setup, links: &dyn Links) -> Instrument {
-    match setup.open(links) {
-        Ok(instrument) => instrument,
-        Err(error) => panic!("{}", text(&error)),
-    }
-}
-
-/// Opens what was just plugged in again: the port may take a moment to appear.
-fn reopen(setup: &dyn Setup) -> Instrument {
-    let deadline = Instant::now() + SOON;
-    loop {
-        match setup.open(&Cable) {
-            Ok(instrument) => return instrument,
-            Err(error) if error.may_pass() && Instant::now() < deadline => {
-                std::thread::yield_now();
-            }
-            Err(error) => panic!("{}", text(&error)),
-        }
-    }
-}
-
-/// Does once what the instrument is for.
-fn work(instrument: &mut Instrument, cell: &DemoCell) -> Result<(), DeviceError> {
-    match instrument {
-        Instrument::Profiler(profiler) => {
-            profiler.start()?;
-            profiler.next(Instant::now() + SOON)?;
-            profiler.stop().map(drop)
-        }
-        Instrument::Probe(probe) => touch(probe.as_mut(), cell, 0).map(drop),
-    }
-}
-
-fn touch(probe: &mut dyn Probe, cell: &DemoCell, which: usize) -> Result<[f64; 3], DeviceError> {
-    let way = &cell.touches[which];
-    let touch = probe.touch(way.start.to_array(), way.target.to_array(), SOON)?;
-    Ok(touch.tip_centre_mm)
-}
+use bench::{Bench, SOON, benches, by_port, open, port, text, touch};
 
 // ---- The table --------------------------------------------------------------------------------------------------------
 
@@ -184,7 +44,14 @@ fn the_table_of_drivers_is_sound() {
             file.display()
         );
         assert!(!driver.summary.is_empty() && !driver.summary.ends_with('.'));
-        bench(driver);
+        let tried = benches()
+            .iter()
+            .any(|bench| bench.driver.name == driver.name);
+        assert!(
+            tried,
+            "driver {} has no simulator in tests/drivers/bench.rs",
+            driver.name
+        );
         let unknown = toml::Table::from_iter([("no_such_key".into(), toml::Value::Integer(1))]);
         let mistakes = (driver.configure)(unknown).expect_err("an unknown key and no link");
         let keys: Vec<&str> = mistakes
@@ -195,151 +62,15 @@ fn the_table_of_drivers_is_sound() {
     }
 }
 
-// ---- Every driver -----------------------------------------------------------------------------------------------------
-
-#[test]
-fn each_opens_its_device_and_works() {
-    let cell = DemoCell::new(1);
-    for bench in benches() {
-        let port = port("works", bench.driver.name);
-        let _device = bench.start(&cell, &port);
-        let setup = bench.setup(&by_port(&port), "");
-        let claims: Vec<String> = setup.claims().iter().map(ToString::to_string).collect();
-        assert_eq!(claims, [format!("port {}", port.display())]);
-        let mut instrument = open(&*setup, &Cable);
-        let identity = match &instrument {
-            Instrument::Profiler(profiler) => profiler.identity(),
-            Instrument::Probe(probe) => probe.identity(),
-        };
-        assert!(!identity.vendor.is_empty() && !identity.firmware.is_empty());
-        work(&mut instrument, &cell).expect("work");
-        assert!(
-            refusal(&*setup)
-                .ends_with("another program has it open; close that program, then retry"),
-            "a second opening"
-        );
-    }
-}
-
-#[test]
-fn each_refuses_another_device_than_its_own() {
-    let cell = DemoCell::new(1);
-    for bench in benches() {
-        let port = port("another", bench.driver.name);
-        let _device = bench.start(&cell, &port);
-        let text = refusal(&*bench.setup(&by_port(&port), bench.wrong));
-        assert!(
-            text.contains("the configuration expects \"ANOTHER\""),
-            "{}: {text}",
-            bench.driver.name
-        );
-    }
-}
-
-#[test]
-fn each_says_that_nothing_is_plugged_in() {
-    for bench in benches() {
-        let port = port("absent", bench.driver.name);
-        assert_eq!(
-            refusal(&*bench.setup(&by_port(&port), "")),
-            format!(
-                "{}: cannot be used: nothing of this name is there; check cable, power and the name",
-                port.display()
-            )
-        );
-    }
-}
-
-#[test]
-fn each_says_that_its_device_is_silent() {
-    let mut options = DemoOptions::new(1);
-    options.faults.silent_after = Some(0);
-    options.probe_faults.silent_after = Some(0);
-    let cell = DemoCell::with_options(options);
-    for bench in benches() {
-        let port = port("silent", bench.driver.name);
-        let _device = bench.start(&cell, &port);
-        let text = refusal(&*bench.setup(&by_port(&port), ""));
-        assert!(
-            text.ends_with("no answer within 3 s; check power and cable, then retry"),
-            "{}: {text}",
-            bench.driver.name
-        );
-    }
-}
-
-#[test]
-fn each_survives_unplugging_in_the_middle_of_its_work() {
-    let cell = DemoCell::new(2);
-    for bench in benches() {
-        let port = port("unplugged", bench.driver.name);
-        let device = bench.start(&cell, &port);
-        let setup = bench.setup(&by_port(&port), "");
-        let mut instrument = open(&*setup, &Cable);
-        if let Instrument::Profiler(profiler) = &mut instrument {
-            profiler.start().expect("a start");
-        }
-        device.unplug();
-        let deadline = Instant::now() + SOON;
-        let error = loop {
-            assert!(
-                Instant::now() < deadline,
-                "{}: nobody noticed",
-                bench.driver.name
-            );
-            let worked = match &mut instrument {
-                Instrument::Profiler(profiler) => profiler.next(deadline).map(drop),
-                Instrument::Probe(probe) => touch(probe.as_mut(), &cell, 0).map(drop),
-            };
-            if let Err(error) = worked {
-                break error;
-            }
-        };
-        assert!(error.may_pass());
-        assert!(
-            text(&error).ends_with("it is gone: closed or unplugged; plug it in again and reopen"),
-            "{}",
-            text(&error)
-        );
-        drop(instrument);
-        device.replug();
-        work(&mut reopen(&*setup), &cell).expect("work after plugging in again");
-        assert!(device.goes_dark());
-    }
-}
-
-#[test]
-fn each_leaves_the_laser_off_after_stop_and_after_drop() {
-    let cell = DemoCell::new(3);
-    for bench in benches() {
-        let port = port("dark", bench.driver.name);
-        let device = bench.start(&cell, &port);
-        let setup = bench.setup(&by_port(&port), "");
-        let mut instrument = open(&*setup, &Cable);
-        work(&mut instrument, &cell).expect("work");
-        assert!(device.goes_dark(), "{} after stop", bench.driver.name);
-        if let (Instrument::Profiler(profiler), Simulated::Profiler(device)) =
-            (&mut instrument, &device)
-        {
-            profiler.start().expect("a start");
-            assert!(device.status().laser_on, "{}", bench.driver.name);
-        }
-        drop(instrument);
-        if let Simulated::Profiler(device) = &device {
-            assert!(
-                !device.status().laser_on,
-                "{} after drop",
-                bench.driver.name
-            );
-        }
-    }
-}
-
 // ---- Profilers --------------------------------------------------------------------------------------------------------
 
+fn bench_of(name: &str) -> Bench {
+    let found = benches().into_iter().find(|bench| bench.name == name);
+    found.expect("a bench of that name")
+}
+
 fn profiler_bench() -> Bench {
-    let driver = ALL.iter().find(|driver| driver.name == "open-profile");
-    bench(driver.expect("the driver"))
+    bench_of("open-profile")
 }
 
 fn simulated_profiler(faults: &str, test: &str) -> (SimulatedProfiler, Box<dyn Profiler>) {
@@ -428,7 +159,10 @@ fn losses_on_a_bad_line_are_exact() {
 
 #[test]
 fn losses_under_every_fault_of_framing_are_exact() {
-    losses_are_exact("lie=0.02,babble=0.05,duplicate=0.03,split", "framing");
+    losses_are_exact(
+        "lie=0.02,babble=0.05,duplicate=0.03,split,truncated,encoder-jitter,clock-drift",
+        "framing",
+    );
 }
 
 #[test]
@@ -474,6 +208,27 @@ fn the_same_device_over_tcp() {
     let profiles = scan(profiler.as_mut(), 100).expect("a scan");
     assert_eq!(profiles.len(), device.status().sent as usize);
     drop(profiler);
+    assert!(!device.status().laser_on);
+}
+
+#[test]
+fn serial_sensors_over_tcp_as_behind_a_serial_server() {
+    let setup = acies_simulators::rf60x::Setup {
+        faults: "latency-lumps,split".parse().expect("the test's faults"),
+        ..acies_simulators::rf60x::Setup::new(&[17_185], 4)
+    };
+    let address: SocketAddr = "127.0.0.1:0".parse().expect("an address");
+    let wire = Wire::tcp(address).expect("a listener");
+    let device = acies_simulators::rf60x::start(wire, setup).expect("a device");
+    let link = format!("address = {:?}", device.port());
+    let opened = open(&*bench_of("rf60x").setup(&link, ""), &Cable);
+    let Instrument::Profiler(mut sensor) = opened else {
+        panic!("no profiler");
+    };
+    let profiles = scan(sensor.as_mut(), 100).expect("a scan");
+    assert_eq!(profiles.len(), device.truth().values.len());
+    assert_eq!(sensor.losses().lost_on_link, 0);
+    drop(sensor);
     assert!(!device.status().laser_on);
 }
 
@@ -526,8 +281,7 @@ fn simulated_probe(
     let port = port(test, "grbl-probe");
     let wire = Wire::pty(&port).expect("a pseudo-terminal");
     let device = cell.start_probe(wire).expect("a simulated device");
-    let driver = ALL.iter().find(|driver| driver.name == "grbl-probe");
-    let setup = bench(driver.expect("the driver")).setup(&by_port(&port), more);
+    let setup = bench_of("grbl-probe").setup(&by_port(&port), more);
     (cell, device, setup)
 }
 

@@ -18,9 +18,9 @@ pub enum Capture {
 pub struct Profile {
     /// Counts the profiles the device sent in this run, from 0; a gap is loss on the link.
     pub sequence: u32,
-    /// Differs after every start of the device.
+    /// Differs after every start of the device; 0 where the device does not say.
     pub boot: u32,
-    /// Device clock at the centre of the exposure, raw, in ns since the device started.
+    /// Device clock at the centre of the exposure, raw, in ns since the device started; 0 where it has no clock.
     pub device_time_ns: u64,
     /// Encoder counts at the centre of the exposure; `None` where the device has no encoder.
     pub encoder: Option<i64>,

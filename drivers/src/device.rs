@@ -83,6 +83,9 @@ pub struct Identity {
 
 /// What was lost on the way, since the run started. Nothing is lost silently.
 ///
+/// An instrument of single points counts its values here, whether or not several make one profile. One whose stream has no end
+/// mark knows nothing of what was lost behind the last value that came.
+///
 /// After [`Profiler::stop`], `received + lost_on_link` is the number of profiles that the device sent. `rejected` and
 /// `skipped_bytes` tell why some of them are missing, and are no further losses.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]

@@ -2,7 +2,7 @@
 //!
 //! In reading order: [`capture`] (what instruments deliver), [`device`] (the driver contract), [`link`] (bytes to and from a
 //! device, recorded and replayed), then one file a driver. To add one: write `<model>.rs`, add a line to [`ALL`].
-//! [`attached`] lists what is plugged in.
+//! [`point`] is what drivers of single-point sensors share; [`attached`] lists what is plugged in.
 
 #![forbid(unsafe_code)]
 
@@ -13,7 +13,17 @@ pub mod error;
 pub mod grbl_probe;
 pub mod link;
 pub mod open_profile;
+pub mod optoncdt;
+pub mod point;
+pub mod rf60x;
+pub mod serial_gauge;
 pub mod settings;
 
 /// Every driver, in the order shown to people.
-pub static ALL: &[device::Driver] = &[open_profile::DRIVER, grbl_probe::DRIVER];
+pub static ALL: &[device::Driver] = &[
+    open_profile::DRIVER,
+    grbl_probe::DRIVER,
+    optoncdt::DRIVER,
+    rf60x::DRIVER,
+    serial_gauge::DRIVER,
+];

@@ -13,6 +13,7 @@ use crate::device::Claim;
 use crate::error::LinkError;
 
 pub mod cable;
+pub(crate) mod pump;
 pub mod recording;
 pub mod replay;
 

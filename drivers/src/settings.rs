@@ -171,6 +171,20 @@ impl Keys {
         found.map(|(_, choice)| *choice)
     }
 
+    /// What stands in `choices` beside the whole number under `key`.
+    pub fn choice_of_numbers<T: Copy>(
+        &mut self,
+        key: &'static str,
+        choices: &[(i64, T)],
+    ) -> Option<T> {
+        let numbers: Vec<String> = choices.iter().map(|(n, _)| n.to_string()).collect();
+        self.read(key, &numbers.join(" or "), |value| {
+            let number = value.as_integer()?;
+            let found = choices.iter().find(|(choice, _)| *choice == number);
+            found.map(|(_, choice)| *choice)
+        })
+    }
+
     /// Three finite numbers under `key`.
     pub fn vector(&mut self, key: &'static str) -> Option<[f64; 3]> {
         self.read(key, "three numbers, as in [0.0, 0.0, -50.0]", numbers)

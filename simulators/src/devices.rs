@@ -6,8 +6,12 @@ use std::path::PathBuf;
 
 use crate::demo_cell::{DemoCell, DemoOptions};
 use crate::faults::{FaultError, Faults};
+use crate::gauge::{self, Dialect};
 use crate::grbl::SimulatedProbe;
 use crate::open_profile::SimulatedProfiler;
+use crate::optoncdt;
+use crate::point::SimulatedSensor;
+use crate::rf60x;
 use crate::wire::Wire;
 
 /// A kind of device that can be started.
@@ -20,7 +24,7 @@ pub struct Kind {
 }
 
 /// Every kind.
-pub const ALL: [Kind; 3] = [
+pub const ALL: [Kind; 9] = [
     Kind {
         name: "open-profile",
         summary: "line-laser profiler of the open-profile protocol, looking from the left",
@@ -32,6 +36,30 @@ pub const ALL: [Kind; 3] = [
     Kind {
         name: "grbl-probe",
         summary: "touch probe on a GRBL controller",
+    },
+    Kind {
+        name: "optoncdt",
+        summary: "laser distance sensor optoNCDT 1420 over RS-422",
+    },
+    Kind {
+        name: "rf60x",
+        summary: "two laser distance sensors RF603 on an RS-485 bus",
+    },
+    Kind {
+        name: "heidenhain-nd",
+        summary: "display of a length gauge, Heidenhain ND 281B",
+    },
+    Kind {
+        name: "mitutoyo",
+        summary: "two dial gauges on a Mitutoyo multiplexer",
+    },
+    Kind {
+        name: "sylvac",
+        summary: "dial gauge of the Sylvac Opto-RS interface",
+    },
+    Kind {
+        name: "keyence",
+        summary: "two laser distance sensors Keyence IL on a DL-RS1A",
     },
 ];
 
@@ -51,6 +79,8 @@ pub enum Simulated {
     Profiler(SimulatedProfiler),
     /// A probe.
     Probe(SimulatedProbe),
+    /// A sensor of single points, or several of them.
+    Sensor(SimulatedSensor),
 }
 
 impl Simulated {
@@ -59,6 +89,7 @@ impl Simulated {
         match self {
             Simulated::Profiler(profiler) => profiler.port(),
             Simulated::Probe(probe) => probe.port(),
+            Simulated::Sensor(sensor) => sensor.port(),
         }
     }
 }
@@ -91,6 +122,7 @@ pub enum StartError {
 /// An unknown name, unreadable faults, or a place that cannot be taken.
 pub fn start(name: &str, place: &Place, seed: u64, faults: &str) -> Result<Simulated, StartError> {
     let faults: Faults = faults.parse()?;
+    let of_sensor = faults.clone();
     let cell = DemoCell::with_options(DemoOptions {
         paced: true,
         faults: faults.clone(),
@@ -108,7 +140,29 @@ pub fn start(name: &str, place: &Place, seed: u64, faults: &str) -> Result<Simul
         Place::Pty(path) => path.display().to_string(),
         Place::Tcp(address) => address.to_string(),
     };
+    let gauge = |dialect, channels, wire| {
+        let setup = gauge::Setup {
+            channels,
+            faults: of_sensor.clone(),
+            ..gauge::Setup::new(dialect, seed)
+        };
+        gauge::start(wire, setup).map(Simulated::Sensor)
+    };
     let started = wire.and_then(|wire| match name {
+        "optoncdt" => {
+            let mut setup = optoncdt::Setup::new("SIM-1420", seed);
+            setup.faults.clone_from(&of_sensor);
+            optoncdt::start(wire, setup).map(Simulated::Sensor)
+        }
+        "rf60x" => {
+            let mut setup = rf60x::Setup::new(&[17_185, 17_186], seed);
+            setup.faults.clone_from(&of_sensor);
+            rf60x::start(wire, setup).map(Simulated::Sensor)
+        }
+        "heidenhain-nd" => gauge(Dialect::HeidenhainNd, 1, wire),
+        "mitutoyo" => gauge(Dialect::Mitutoyo, 2, wire),
+        "sylvac" => gauge(Dialect::Sylvac, 1, wire),
+        "keyence" => gauge(Dialect::Keyence, 2, wire),
         "grbl-probe" => cell.start_probe(wire).map(Simulated::Probe),
         "open-profile-right" => cell.start_profiler(1, wire).map(Simulated::Profiler),
         _ => cell.start_profiler(0, wire).map(Simulated::Profiler),
@@ -126,7 +180,8 @@ mod tests {
         let unknown = start("toaster", &tcp, 1, "").unwrap_err().to_string();
         assert_eq!(
             unknown,
-            "simulator: no device is called \"toaster\", expected one of open-profile, open-profile-right, grbl-probe"
+            "simulator: no device is called \"toaster\", expected one of open-profile, open-profile-right, grbl-probe, \
+             optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac, keyence"
         );
         let fault = start("grbl-probe", &tcp, 1, "drop=x")
             .unwrap_err()

@@ -2,7 +2,8 @@
 //! that a misreading in a driver cannot repeat itself here.
 //!
 //! In reading order: [`scene`] (exact solids and their true edges), [`sensor`] (what a profiler sees of them), [`demo_part`] and
-//! [`demo_cell`] (the demo's part and cell), [`pty`] (wires), [`faults`] (how a device misbehaves), then one file a device.
+//! [`demo_cell`] (the demo's part and cell), [`pty`] (wires), [`faults`] (how a device misbehaves), [`point`] (what sensors of
+//! single points share), then one file a device.
 
 #![forbid(unsafe_code)]
 
@@ -25,6 +26,14 @@ pub mod open_profile;
 pub mod contact;
 
 pub mod grbl;
+
+pub mod point;
+
+pub mod optoncdt;
+
+pub mod rf60x;
+
+pub mod gauge;
 
 pub mod demo_cell;
 

@@ -302,6 +302,7 @@ impl Runner {
             lumps: faults.lumps,
             split: faults.split,
             baud: faults.baud,
+            wrong_parity: faults.wrong_parity,
             rng,
             replug_after: faults.replug,
             replug_at: None,
@@ -345,6 +346,98 @@ pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
+/// A device without a wire, in a time of its own: bytes in, bytes out, as fast as they can be computed.
+///
+/// The same model as behind a [`Wire`], so that a minute of device time takes milliseconds and is the same every time.
+pub struct Desk {
+    model: Box<dyn Model>,
+    out: Outbox,
+    lumps: bool,
+    began: Instant,
+    now: Duration,
+    pulled: bool,
+}
+
+impl std::fmt::Debug for Desk {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Desk")
+            .field("now", &self.now)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Desk {
+    pub(crate) fn new<M: Model>(faults: &Faults, model: impl FnOnce(Instant) -> M) -> Desk {
+        let began = Instant::now();
+        let mut desk = Desk {
+            model: Box::new(model(began)),
+            out: Outbox::default(),
+            lumps: faults.lumps,
+            began,
+            now: Duration::ZERO,
+            pulled: false,
+        };
+        desk.model.attached(&mut desk.out);
+        desk
+    }
+
+    /// Device time that has passed.
+    pub fn now(&self) -> Duration {
+        self.now
+    }
+
+    /// Whether the device had its cable pulled.
+    pub fn is_unplugged(&self) -> bool {
+        self.pulled
+    }
+
+    /// The host writes.
+    pub fn write(&mut self, bytes: &[u8]) {
+        if !self.pulled {
+            self.model.take(bytes, self.began + self.now, &mut self.out);
+        }
+    }
+
+    /// Lets time pass until `until`, or until something has come; what came, and `None` where nothing did.
+    ///
+    /// In lumps where the faults say so: what was sent arrives at the next multiple of their interval.
+    pub fn read(&mut self, until: Duration) -> Option<Vec<u8>> {
+        while !self.pulled {
+            let next = self.model.step(self.began + self.now, &mut self.out);
+            let tick = LUMP.as_nanos();
+            let waits = self.lumps && !self.now.as_nanos().is_multiple_of(tick);
+            if self.out.len() > 0 && !waits {
+                let bytes: Vec<u8> = self.out.bytes.iter().copied().collect();
+                self.out.sent(bytes.len());
+                return Some(bytes);
+            }
+            if matches!(next, Next::Unplug) && self.out.len() == 0 {
+                self.pulled = true;
+                self.model.detached(true, &[]);
+                break;
+            }
+            if self.now >= until {
+                break;
+            }
+            let due = match next {
+                Next::At(due) => due.saturating_duration_since(self.began),
+                Next::Wait | Next::Unplug => until,
+            };
+            let mut to = due.clamp(self.now, until);
+            if waits && self.out.len() > 0 {
+                let lump = (self.now.as_nanos() / tick + 1) * tick;
+                to = to.min(Duration::from_nanos(lump as u64)).max(self.now);
+            }
+            if to == self.now && due <= self.now {
+                // the device has more to do at this very moment
+                continue;
+            }
+            self.now = to;
+        }
+        None
+    }
+}
+
 struct Serving<M> {
     wire: Wire,
     model: M,
@@ -354,6 +447,7 @@ struct Serving<M> {
     lumps: bool,
     split: bool,
     baud: Option<u32>,
+    wrong_parity: bool,
     rng: ChaCha8Rng,
     replug_after: Option<Duration>,
     replug_at: Option<Instant>,
@@ -440,6 +534,8 @@ impl<M: Model> Serving<M> {
         loop {
             match self.wire.read(&mut buffer) {
                 Ok(0) => return true,
+                // a byte with a parity error is no byte
+                Ok(_) if self.wrong_parity => {}
                 Ok(n) => self.model.take(&buffer[..n], Instant::now(), &mut self.out),
                 Err(_) => return false,
             }
@@ -472,7 +568,9 @@ impl<M: Model> Serving<M> {
                 front.len()
             };
             let piece = &front[..front.len().min(most)];
-            let written = if garbled {
+            let written = if self.wrong_parity {
+                self.wire.write(&vec![0; piece.len()])
+            } else if garbled {
                 let mut rubbish = vec![0; piece.len()];
                 self.rng.fill_bytes(&mut rubbish);
                 self.wire.write(&rubbish)

@@ -14,7 +14,7 @@ use super::{Failure, Status, print_line};
 #[derive(Debug, clap::Args)]
 #[command(after_help = AFTER)]
 pub struct Simulate {
-    /// Which device: open-profile, open-profile-right or grbl-probe.
+    /// Which device: open-profile, open-profile-right, grbl-probe, optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac or keyence.
     device: String,
     /// Path under which the pseudo-terminal appears.
     #[arg(long, value_name = "PATH", conflicts_with = "tcp")]
@@ -35,7 +35,10 @@ const AFTER: &str =
   lose=P lose-frame=P flip=P lie=P babble=P split lumps baud=N   on the wire
   drop=P duplicate=P jump=N:COUNTS                        profiles dropped or doubled, encoder jumps
   silent-after=N reboot-after=N unplug-after=N replug-ms=M
-  no-contact damage-prb=N alarm reset-in-move=N           the probe's";
+  no-contact damage-prb=N alarm reset-in-move=N           the probe's
+  burst=P wrong-parity chatter=P sentinel=P overrun=P truncate=P near-wrap late-ms=M autostart refuse=N
+  drift-ppm=X other-identity swap-bytes                   the serial sensors'
+  or the name of a case, as in byte-loss or hot-unplug    all that belongs to it";
 
 impl Simulate {
     /// Carries the command out.

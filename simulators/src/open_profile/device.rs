@@ -383,15 +383,23 @@ impl Device {
         let faults = &self.setup.faults;
         let index = run.exposures;
         run.exposures += 1;
-        let time_ns = run.began_ns + u64::from(index) * run.period.as_nanos() as u64;
+        let since_ns = u64::from(index) * run.period.as_nanos() as u64;
+        let fast_ns = (since_ns as f64 * faults.drift_ppm * 1e-6).round() as i64;
+        let time_ns = (run.began_ns + since_ns).saturating_add_signed(fast_ns);
         self.clock_ns = time_ns;
         let mut happens = |p: f64| p > 0.0 && self.chance.random_bool(p);
-        let (drop, lose, duplicate, lie) = (
+        let (drop, lose, duplicate, lie, truncate) = (
             happens(faults.drop),
             happens(faults.lose_frame),
             happens(faults.duplicate),
             happens(faults.lie),
+            happens(faults.truncate),
         );
+        let jitter = i64::from(faults.jitter);
+        let beside = match jitter {
+            0 => 0,
+            _ => self.chance.random_range(-jitter..=jitter),
+        };
         let number = last.run;
         if drop || full {
             last.dropped += 1;
@@ -405,7 +413,8 @@ impl Device {
             time_ns,
             encoder: line
                 .encoder
-                .wrapping_add(jump.map_or(0, |(_, counts)| counts)),
+                .wrapping_add(jump.map_or(0, |(_, counts)| counts))
+                .wrapping_add(beside),
             dropped: last.dropped,
             flags: 1 | u16::from(line.saturated) << 1,
             scale: self.scale(),
@@ -416,7 +425,7 @@ impl Device {
         });
         let sequence = last.unwrap_or_default();
         let payload = msg::profile(&head, line);
-        let fate = self.put_out(sequence, &payload, [lose, duplicate, lie], out);
+        let fate = self.put_out(sequence, &payload, [lose, duplicate, lie, truncate], out);
         if let Some(record) = self.log(number, index, Some(sequence), fate) {
             out.mark(record);
         }
@@ -427,7 +436,7 @@ impl Device {
         &mut self,
         sequence: u32,
         payload: &[u8],
-        [lose, duplicate, lie]: [bool; 3],
+        [lose, duplicate, lie, truncate]: [bool; 4],
         out: &mut Outbox,
     ) -> Fate {
         if lose || self.silent {
@@ -445,6 +454,10 @@ impl Device {
             return Fate::Damaged;
         }
         let frame = encode(msg::PROFILE, sequence, payload);
+        if truncate {
+            self.send(&frame[..frame.len() / 2], out);
+            return Fate::Damaged;
+        }
         let damaged = self.send(&frame, out);
         // a second copy makes good what the first one lost
         let again = duplicate.then(|| self.send(&frame, out));
