@@ -82,8 +82,12 @@ fn bench(driver: &'static Driver) -> Bench {
     }
 }
 
+/// Drivers without a serial line: `drivers/tests/network` and `drivers/tests/usb` hold them to their simulators.
+const NOT_SERIAL: [&str; 4] = ["gocator", "ippdme", "u3v-profiler", "usb-itn"];
+
 fn benches() -> Vec<Bench> {
-    ALL.iter().map(bench).collect()
+    let serial = |driver: &&Driver| !NOT_SERIAL.contains(&driver.name);
+    ALL.iter().filter(serial).map(bench).collect()
 }
 
 /// Where a simulated port appears: a path of this test's own.
@@ -184,14 +188,14 @@ fn the_table_of_drivers_is_sound() {
             file.display()
         );
         assert!(!driver.summary.is_empty() && !driver.summary.ends_with('.'));
-        bench(driver);
         let unknown = toml::Table::from_iter([("no_such_key".into(), toml::Value::Integer(1))]);
         let mistakes = (driver.configure)(unknown).expect_err("an unknown key and no link");
         let keys: Vec<&str> = mistakes
             .iter()
             .map(|mistake| mistake.key.as_str())
             .collect();
-        assert_eq!(keys, ["port", "no_such_key"], "{}", driver.name);
+        assert_eq!(keys.last(), Some(&"no_such_key"), "{}", driver.name);
+        assert!(keys.len() > 1, "{}: no link, and no mistake", driver.name);
     }
 }
 

@@ -10,10 +10,11 @@ pub mod attached;
 pub mod capture;
 pub mod device;
 pub mod error;
+pub mod gocator;
 pub mod grbl_probe;
 pub mod link;
 pub mod open_profile;
 pub mod settings;
 
 /// Every driver, in the order shown to people.
-pub static ALL: &[device::Driver] = &[open_profile::DRIVER, grbl_probe::DRIVER];
+pub static ALL: &[device::Driver] = &[open_profile::DRIVER, grbl_probe::DRIVER, gocator::DRIVER];

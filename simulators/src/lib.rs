@@ -22,6 +22,8 @@ pub mod wire;
 
 pub mod open_profile;
 
+pub mod gocator;
+
 pub mod contact;
 
 pub mod grbl;

@@ -1,0 +1,4 @@
+//! Network drivers against simulated devices that were written from the same manuals by other eyes, and hostile peers.
+
+mod gocator;
+mod support;
