@@ -58,6 +58,8 @@ const REPLY_TO_START: Duration = Duration::from_secs(10);
 const QUIET: Duration = Duration::from_millis(200);
 /// Longest time for what is under way when the sensor is stopped.
 const EMPTYING: Duration = Duration::from_secs(30);
+/// How long the first health message is waited for.
+const FIRST_HEALTH: Duration = Duration::from_secs(2);
 /// Replies to others that are passed over before the right one.
 const STRAY: u32 = 16;
 
@@ -297,6 +299,7 @@ struct Gocator {
     threads: Vec<JoinHandle<()>>,
     identity: Identity,
     reading: Reading,
+    has_health: bool,
 }
 
 impl Gocator {
@@ -314,6 +317,7 @@ impl Gocator {
             threads: Vec::new(),
             identity,
             reading: settings.reading,
+            has_health: health.is_some(),
         };
         let (shared, reading) = (Arc::clone(&device.shared), device.reading);
         device.spawn("gocator-data", move || {
@@ -371,6 +375,11 @@ impl Profiler for Gocator {
             let mut inbox = self.shared.lock();
             if inbox.running {
                 return Err(self.out_of_order("start", "the run before to be stopped"));
+            }
+            // Dropped triggers count from the value before the run, which comes about once a second.
+            let patience = Instant::now() + FIRST_HEALTH;
+            while self.has_health && inbox.drops.is_none() && Instant::now() < patience {
+                inbox = self.shared.wait(inbox, patience);
             }
             inbox.begin(&self.reading);
         }

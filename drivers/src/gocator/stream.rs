@@ -373,6 +373,7 @@ pub(super) fn take_health(
                 .reduce(i64::saturating_add);
             if let Some(value) = drops {
                 shared.lock().note_drops(value);
+                shared.arrived.notify_all();
             }
         }
     })
