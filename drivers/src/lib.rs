@@ -12,9 +12,15 @@ pub mod device;
 pub mod error;
 pub mod gocator;
 pub mod grbl_probe;
+pub mod ippdme;
 pub mod link;
 pub mod open_profile;
 pub mod settings;
 
 /// Every driver, in the order shown to people.
-pub static ALL: &[device::Driver] = &[open_profile::DRIVER, grbl_probe::DRIVER, gocator::DRIVER];
+pub static ALL: &[device::Driver] = &[
+    open_profile::DRIVER,
+    grbl_probe::DRIVER,
+    gocator::DRIVER,
+    ippdme::DRIVER,
+];

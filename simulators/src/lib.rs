@@ -24,6 +24,8 @@ pub mod open_profile;
 
 pub mod gocator;
 
+pub mod ippdme;
+
 pub mod contact;
 
 pub mod grbl;
