@@ -16,6 +16,8 @@ pub mod ippdme;
 pub mod link;
 pub mod open_profile;
 pub mod settings;
+pub mod u3v_profiler;
+pub mod usb_itn;
 
 /// Every driver, in the order shown to people.
 pub static ALL: &[device::Driver] = &[
@@ -23,4 +25,6 @@ pub static ALL: &[device::Driver] = &[
     grbl_probe::DRIVER,
     gocator::DRIVER,
     ippdme::DRIVER,
+    u3v_profiler::DRIVER,
+    usb_itn::DRIVER,
 ];

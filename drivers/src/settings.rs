@@ -249,6 +249,15 @@ impl Keys {
         })
     }
 
+    /// Vendor and product number of a USB device under `key`.
+    pub fn usb_id_under(&mut self, key: &'static str) -> Option<(u16, u16)> {
+        let text = self.text(key)?;
+        match self.usb_id(&text)? {
+            Port::UsbId { vendor, product } => Some((vendor, product)),
+            _ => None,
+        }
+    }
+
     fn usb_id(&mut self, text: &str) -> Option<Port> {
         let number = |digits: &str| {
             let hex = digits.len() <= 4 && digits.bytes().all(|b| b.is_ascii_hexdigit());

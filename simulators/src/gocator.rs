@@ -6,6 +6,8 @@
 
 mod wire;
 
+pub(crate) use wire::resample;
+
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
 use std::sync::{Arc, Condvar, Mutex};

@@ -26,6 +26,12 @@ pub mod gocator;
 
 pub mod ippdme;
 
+pub mod usb;
+
+pub mod u3v;
+
+pub mod usb_itn;
+
 pub mod contact;
 
 pub mod grbl;

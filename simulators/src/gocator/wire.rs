@@ -329,14 +329,21 @@ fn rows_of(line: &Line, form: Form) -> Rows {
     rows
 }
 
-/// z at the uniform steps, linear between neighbours that were both seen.
 fn resampled(line: &Line, rows: &Rows) -> Vec<f64> {
+    resample(
+        line,
+        f64::from(rows.x_offset_um) * 1e-3,
+        f64::from(rows.x_scale_nm) * 1e-6,
+    )
+}
+
+/// z at equal steps from `origin`, mm, linear between neighbours that were both seen; one for each column of the line.
+pub(crate) fn resample(line: &Line, origin: f64, step: f64) -> Vec<f64> {
     let n = line.x_mm.len();
     let mut at = 0;
     (0..n)
         .map(|i| {
-            let x =
-                f64::from(rows.x_offset_um) * 1e-3 + i as f64 * f64::from(rows.x_scale_nm) * 1e-6;
+            let x = origin + i as f64 * step;
             while at + 2 < n && line.x_mm[at + 1] < x {
                 at += 1;
             }
@@ -344,7 +351,10 @@ fn resampled(line: &Line, rows: &Rows) -> Vec<f64> {
                 return line.z_mm[0];
             }
             let (x0, x1) = (line.x_mm[at], line.x_mm[at + 1]);
-            let t = ((x - x0) / (x1 - x0)).clamp(0.0, 1.0);
+            if !(x0..=x1).contains(&x) {
+                return f64::NAN;
+            }
+            let t = (x - x0) / (x1 - x0);
             line.z_mm[at] * (1.0 - t) + line.z_mm[at + 1] * t
         })
         .collect()
