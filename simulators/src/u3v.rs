@@ -304,9 +304,9 @@ impl Profiler {
             self.stream
                 .push_back(self.trailer(id, status, valid as u64));
         }
-        if discarded && !no_leader && !no_trailer {
+        if discarded && !(short || no_leader || no_trailer) {
             self.truth.discarded += 1;
-        } else if !(short || no_leader || no_trailer) {
+        } else if !(discarded || short || no_leader || no_trailer) {
             self.truth.sent_count += 1;
             if self.truth.sent.len() < 1_000_000 {
                 self.truth.sent.push(id);
@@ -515,8 +515,10 @@ impl Model for Profiler {
         match endpoint {
             CONTROL_IN => self.acks.pop_front().map_or(Outcome::Nak, Outcome::Data),
             STREAM_IN => {
+                let between = self.stream.is_empty();
                 let stalls = &mut self.setup.misdeeds;
-                if self.acquiring && (stalls.stall_for_ever || stalls.stall_at == Some(self.next)) {
+                let now = stalls.stall_for_ever || between && stalls.stall_at == Some(self.next);
+                if self.acquiring && now {
                     stalls.stall_at = None;
                     return Outcome::Stall;
                 }

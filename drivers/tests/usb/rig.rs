@@ -294,11 +294,20 @@ enum AnyCarrier {
     Itn(Carrier<InputTool>),
 }
 
-/// The parent's side.
+/// A folder that goes when it is dropped.
+struct Folder(PathBuf);
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+/// The parent's side. The carrier goes before its folder does.
 pub struct OverLibusb {
-    folder: PathBuf,
-    plug: Plug,
     carrier: AnyCarrier,
+    plug: Plug,
+    _folder: Folder,
 }
 
 impl OverLibusb {
@@ -316,8 +325,8 @@ impl OverLibusb {
         };
         OverLibusb {
             carrier: carrier.expect("a carrier"),
-            folder,
             plug,
+            _folder: Folder(folder),
         }
     }
 
@@ -358,11 +367,5 @@ impl OverLibusb {
             _ => panic!("no order {order}"),
         }
         String::new()
-    }
-}
-
-impl Drop for OverLibusb {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.folder);
     }
 }

@@ -57,6 +57,8 @@ const REAP_NO_DELAY: u64 = ioctl(1, 13, 8);
 const CAPABILITIES: u64 = ioctl(2, 26, 4);
 const CLEAR_HALT: u64 = ioctl(2, 21, 4);
 const GET_DRIVER: u64 = ioctl(1, 8, 260);
+/// To the kernel's driver of an interface: there is none.
+const TO_DRIVER: u64 = ioctl(3, 18, 16);
 /// CLAIMINTERFACE, RELEASEINTERFACE, SETCONFIGURATION, SETINTERFACE, RESETEP, RESET: done without anything to do.
 const DONE: [u64; 6] = [
     ioctl(2, 15, 4),
@@ -439,7 +441,7 @@ impl Client {
                 self.done(0, 0)?;
             } else if DONE.contains(&request) {
                 self.done(0, 0)?;
-            } else if request == GET_DRIVER {
+            } else if request == GET_DRIVER || request == TO_DRIVER {
                 self.done(-1, errno::NODATA)?;
             } else {
                 self.done(-1, errno::NOTTY)?;
