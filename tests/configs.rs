@@ -190,3 +190,16 @@ fn text_that_is_no_toml_is_told_with_its_line() {
         "/nowhere/cell.toml: file: No such file or directory (os error 2), expected a readable TOML file"
     );
 }
+
+#[test]
+fn every_example_is_without_mistakes() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+    let mut cells = 0;
+    for entry in std::fs::read_dir(folder).expect("the examples") {
+        let path = entry.expect("an entry").path().join("cell.toml");
+        let cell = Cell::read(&path).unwrap_or_else(|errors| panic!("{errors}"));
+        assert!(!cell.profilers.is_empty(), "{}", path.display());
+        cells += 1;
+    }
+    assert!(cells > 1, "{cells} examples");
+}

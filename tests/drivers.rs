@@ -195,7 +195,13 @@ fn the_table_of_drivers_is_sound() {
             .map(|mistake| mistake.key.as_str())
             .collect();
         assert_eq!(keys.last(), Some(&"no_such_key"), "{}", driver.name);
-        assert!(keys.len() > 1, "{}: no link, and no mistake", driver.name);
+        // A USB device may be the only one of its kind.
+        let by_kind = ["u3v-profiler", "usb-itn"].contains(&driver.name);
+        assert!(
+            by_kind || keys.len() > 1,
+            "{}: no link, and no mistake",
+            driver.name
+        );
     }
 }
 

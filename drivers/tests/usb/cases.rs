@@ -73,6 +73,11 @@ pub const CASES: &[Case] = &[
         run: features_that_cannot_be_set,
     },
     Case {
+        name: "the_example_cells_open",
+        devices: examples,
+        run: the_example_cells_open,
+    },
+    Case {
         name: "itn_reads_a_gauge",
         devices: gauges,
         run: itn_reads_a_gauge,
@@ -587,4 +592,31 @@ fn itn_refusal_and_unplugging(rig: &dyn Rig, variant: usize) {
     assert!(text(&error).ends_with("it is gone: closed or unplugged; plug it in again and reopen"));
     rig.order("replug");
     assert!(open_gauge(rig, "").is_ok());
+}
+
+// ---- Examples ---------------------------------------------------------------------------------------------------------
+
+fn examples() -> Vec<Device> {
+    vec![wave(Misdeeds::default()), gauge(|_| ())]
+}
+
+/// The example cells under configs/: each opens its device.
+fn the_example_cells_open(rig: &dyn Rig, variant: usize) {
+    let driver = ["u3v-profiler", "usb-itn"][variant];
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join(format!("../configs/{driver}/cell.toml"));
+    let read = std::fs::read_to_string(path).expect("an example cell");
+    let cell: toml::Table = read.parse().expect("TOML");
+    let devices = cell["device"].as_array().expect("devices");
+    let device = devices
+        .iter()
+        .find(|device| device["driver"].as_str() == Some(driver));
+    let mut table = device
+        .and_then(|device| device.as_table())
+        .expect("its device")
+        .clone();
+    table.retain(|key, _| !["name", "driver", "calibration"].contains(&key));
+    let mut profiler = open_with(rig, driver, &table.to_string())
+        .unwrap_or_else(|error| panic!("{}", text(&error)));
+    assert!(scan(profiler.as_mut(), 3).expect("a scan").len() >= 3);
 }
