@@ -260,3 +260,16 @@ fn every_example_of_a_driver_opens_its_simulated_devices() {
         }
     }
 }
+
+#[test]
+fn every_example_is_without_mistakes() {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+    let mut cells = 0;
+    for entry in std::fs::read_dir(folder).expect("the examples") {
+        let path = entry.expect("an entry").path().join("cell.toml");
+        let cell = Cell::read(&path).unwrap_or_else(|errors| panic!("{errors}"));
+        assert!(!cell.profilers.is_empty(), "{}", path.display());
+        cells += 1;
+    }
+    assert!(cells > 1, "{cells} examples");
+}

@@ -7,6 +7,7 @@ use serialport::SerialPortType;
 
 use crate::error::LinkError;
 use crate::link::cable;
+use crate::link::usb::udev_rule;
 
 /// Everything found, and what kept us from looking.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
@@ -41,6 +42,17 @@ pub struct UsbDevice {
     pub name: UsbName,
     /// Whether this program may open it now.
     pub access: Access,
+    /// The udev rule that is missing, and the file it belongs in, where that is what keeps this user out.
+    pub missing_rule: Option<MissingRule>,
+}
+
+/// A udev rule that would let this user open a device.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct MissingRule {
+    /// Where it belongs.
+    pub file: &'static str,
+    /// The line.
+    pub rule: String,
 }
 
 /// Who a USB device says it is.
@@ -185,15 +197,26 @@ fn usb_devices() -> Result<Vec<UsbDevice>, rusb::Error> {
             manufacturer: text(|h, d| h.read_manufacturer_string_ascii(d)),
             product: text(|h, d| h.read_product_string_ascii(d)),
         };
+        let refused = opened.err();
         found.push(UsbDevice {
             bus: device.bus_number(),
             address: device.address(),
+            missing_rule: missing_rule(refused, &name),
             name,
-            access: usb_access(opened.err()),
+            access: usb_access(refused),
         });
     }
     found.sort_by_key(|device| (device.bus, device.address));
     Ok(found)
+}
+
+/// The rule to add, where permission is what is lacking.
+fn missing_rule(error: Option<rusb::Error>, name: &UsbName) -> Option<MissingRule> {
+    let denied = error == Some(rusb::Error::Access);
+    denied.then(|| {
+        let (file, rule) = udev_rule(name.vendor_id, name.product_id);
+        MissingRule { file, rule }
+    })
 }
 
 /// What a failure to open a USB device means to a person.
@@ -263,6 +286,21 @@ mod tests {
             told(rusb::Error::Access),
             "this user may not open it; add a udev rule that gives it to a group of this user, then plug it in again"
         );
+        let name = UsbName {
+            vendor_id: 0x0fe7,
+            product_id: 0x4001,
+            serial: None,
+            manufacturer: None,
+            product: None,
+        };
+        let missing = missing_rule(Some(rusb::Error::Access), &name).expect("a rule");
+        assert_eq!(missing.file, "/etc/udev/rules.d/70-acies.rules");
+        assert!(
+            missing
+                .rule
+                .contains("ATTR{idVendor}==\"0fe7\", ATTR{idProduct}==\"4001\"")
+        );
+        assert_eq!(missing_rule(Some(rusb::Error::Busy), &name), None);
         assert_eq!(
             told(rusb::Error::Busy),
             "another program has it open; close that program, then retry"

@@ -32,6 +32,32 @@ pub enum LinkError {
         /// The ports that match.
         ports: Vec<String>,
     },
+    /// A USB device that several are.
+    #[error("it may be any of {devices:?}; name one of these by `usb_serial`")]
+    AmbiguousUsb {
+        /// Where they are.
+        devices: Vec<String>,
+    },
+    /// The system does not let this user open a USB device.
+    #[error("this user may not open it; put the line {rule} into {file}, then plug it in again")]
+    UsbDenied {
+        /// Where the rule belongs.
+        file: &'static str,
+        /// The udev rule.
+        rule: String,
+    },
+    /// USB cannot be used at all.
+    #[error("USB cannot be used here ({reason}); check that /dev/bus/usb is there")]
+    NoUsb {
+        /// What libusb or the link says.
+        reason: String,
+    },
+    /// A USB endpoint that halted.
+    #[error("the device refuses the transfer (stall); reopen it")]
+    Stalled,
+    /// A USB device that sent more than was asked for.
+    #[error("the device sent more than was asked for; reopen it")]
+    Overflow,
     /// Nothing listens on the TCP port, or it has a client already.
     #[error("connection refused; check that the device listens there and has no other client")]
     Refused,
@@ -377,6 +403,8 @@ impl DeviceError {
                 LinkError::Denied { .. }
                     | LinkError::NotSerial
                     | LinkError::Ambiguous { .. }
+                    | LinkError::AmbiguousUsb { .. }
+                    | LinkError::UsbDenied { .. }
                     | LinkError::Departed { .. }
                     | LinkError::Recording(_)
             ),

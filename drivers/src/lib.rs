@@ -10,7 +10,9 @@ pub mod attached;
 pub mod capture;
 pub mod device;
 pub mod error;
+pub mod gocator;
 pub mod grbl_probe;
+pub mod ippdme;
 pub mod link;
 pub mod open_profile;
 pub mod optoncdt;
@@ -18,6 +20,8 @@ pub mod point;
 pub mod rf60x;
 pub mod serial_gauge;
 pub mod settings;
+pub mod u3v_profiler;
+pub mod usb_itn;
 
 /// Every driver, in the order shown to people.
 pub static ALL: &[device::Driver] = &[
@@ -26,4 +30,8 @@ pub static ALL: &[device::Driver] = &[
     optoncdt::DRIVER,
     rf60x::DRIVER,
     serial_gauge::DRIVER,
+    gocator::DRIVER,
+    ippdme::DRIVER,
+    u3v_profiler::DRIVER,
+    usb_itn::DRIVER,
 ];

@@ -16,6 +16,7 @@ pub mod cable;
 pub(crate) mod pump;
 pub mod recording;
 pub mod replay;
+pub mod usb;
 
 /// Opens links, so that cable, recorder and replay are the same to a driver.
 pub trait Links: Send + Sync {
@@ -24,6 +25,16 @@ pub trait Links: Send + Sync {
     /// # Errors
     /// Not there, in use, not permitted or not answering: each is told apart.
     fn open(&self, target: &Target) -> Result<Arc<dyn Link>, LinkError>;
+
+    /// Opens a USB device.
+    ///
+    /// # Errors
+    /// As [`Links::open`]; [`LinkError::NoUsb`] where these links carry none.
+    fn open_usb(&self, target: &usb::UsbTarget) -> Result<Arc<dyn usb::UsbLink>, LinkError> {
+        Err(LinkError::NoUsb {
+            reason: format!("these links do not lead to {target}"),
+        })
+    }
 }
 
 /// An open link. One thread may read while another writes; dropping the last handle closes it.

@@ -246,6 +246,32 @@ impl Keys {
             .or(address.map(|address| Target::Tcp { address }))
     }
 
+    /// Host and port under `key`, written `host` or `host:port`; without a port it is `default_port`.
+    pub fn host_and_port(&mut self, key: &'static str, default_port: u16) -> Option<(String, u16)> {
+        let expected = "a host, or host:port, as in \"192.168.1.10\"";
+        self.needed(key, expected, |keys, key| {
+            let text = keys.text(key)?;
+            if has_port_number(&text) {
+                let (host, port) = text.rsplit_once(':')?;
+                return Some((host.into(), port.parse().ok()?));
+            }
+            if text.contains(':') && !text.ends_with(']') {
+                keys.wrong(key, format!("{text:?}"), expected);
+                return None;
+            }
+            Some((text, default_port))
+        })
+    }
+
+    /// Vendor and product number of a USB device under `key`.
+    pub fn usb_id_under(&mut self, key: &'static str) -> Option<(u16, u16)> {
+        let text = self.text(key)?;
+        match self.usb_id(&text)? {
+            Port::UsbId { vendor, product } => Some((vendor, product)),
+            _ => None,
+        }
+    }
+
     fn usb_id(&mut self, text: &str) -> Option<Port> {
         let number = |digits: &str| {
             let hex = digits.len() <= 4 && digits.bytes().all(|b| b.is_ascii_hexdigit());

@@ -23,6 +23,16 @@ pub mod wire;
 
 pub mod open_profile;
 
+pub mod gocator;
+
+pub mod ippdme;
+
+pub mod usb;
+
+pub mod u3v;
+
+pub mod usb_itn;
+
 pub mod contact;
 
 pub mod grbl;

@@ -48,6 +48,10 @@ fn lines(found: &Attached) -> Vec<String> {
             access(&device.access),
             usb_name(&device.name)
         ));
+        if let Some(missing) = &device.missing_rule {
+            lines.push(format!("  put into {}:", missing.file));
+            lines.push(format!("  {}", missing.rule));
+        }
     }
     if lines.is_empty() {
         lines.push("no serial port and no USB device found".to_owned());
@@ -81,7 +85,7 @@ fn usb_name(name: &UsbName) -> String {
 
 #[cfg(test)]
 mod tests {
-    use acies_drivers::attached::SerialDevice;
+    use acies_drivers::attached::{MissingRule, SerialDevice, UsbDevice};
 
     use super::*;
 
@@ -107,6 +111,34 @@ mod tests {
             lines(&found)[0],
             "/dev/ttyUSB0  may not be opened: no permission; join the group dialout  0403:6001 FTDI, \
              usb_serial = \"A50285BI\""
+        );
+        let denied = UsbDevice {
+            bus: 1,
+            address: 7,
+            name: UsbName {
+                vendor_id: 0x0fe7,
+                product_id: 0x4001,
+                serial: None,
+                manufacturer: None,
+                product: None,
+            },
+            access: Access::Refused("this user may not open it".to_owned()),
+            missing_rule: Some(MissingRule {
+                file: "/etc/udev/rules.d/70-acies.rules",
+                rule: "SUBSYSTEM==\"usb\"".to_owned(),
+            }),
+        };
+        let found = Attached {
+            usb: vec![denied],
+            ..Attached::default()
+        };
+        assert_eq!(
+            lines(&found)[..3],
+            [
+                "usb 001:007  may not be opened: this user may not open it  0fe7:4001",
+                "  put into /etc/udev/rules.d/70-acies.rules:",
+                "  SUBSYSTEM==\"usb\"",
+            ]
         );
         assert_eq!(
             lines(&Attached::default())[0],

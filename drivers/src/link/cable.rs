@@ -11,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use serialport::{SerialPort, SerialPortInfo, SerialPortType, TTYPort};
 
+use super::usb::{self, UsbLink, UsbTarget};
 use super::{Line, Link, Links, Port, Target, left};
 use crate::error::LinkError;
 
@@ -46,6 +47,10 @@ impl Links for Cable {
             }
             Target::Tcp { address } => Ok(Arc::new(Tcp::open(address)?)),
         }
+    }
+
+    fn open_usb(&self, target: &UsbTarget) -> Result<Arc<dyn UsbLink>, LinkError> {
+        usb::open(target)
     }
 }
 

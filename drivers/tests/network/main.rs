@@ -1,0 +1,6 @@
+//! Network drivers against simulated devices that were written from the same manuals by other eyes, and hostile peers.
+
+mod configs;
+mod gocator;
+mod ippdme;
+mod support;

@@ -1,0 +1,622 @@
+//! What every USB driver must do, whichever way leads to its device.
+
+use std::collections::BTreeSet;
+use std::time::{Duration, Instant};
+
+use acies_drivers::ALL;
+use acies_drivers::capture::Profile;
+use acies_drivers::device::{Instrument, Profiler, Setup};
+use acies_drivers::error::DeviceError;
+use acies_simulators::demo_cell::DemoCell;
+use acies_simulators::sensor::View;
+use acies_simulators::u3v::{self, Misdeeds, Surface};
+use acies_simulators::usb_itn::{self, Form, InputTool};
+
+use crate::rig::{Device, Rig, SOON};
+
+/// One case: the devices it is run with, one after the other.
+pub struct Case {
+    pub name: &'static str,
+    pub devices: fn() -> Vec<Device>,
+    pub run: fn(&dyn Rig, usize),
+}
+
+pub const CASES: &[Case] = &[
+    Case {
+        name: "every_line_is_the_scene",
+        devices: scenes,
+        run: every_line_is_the_scene,
+    },
+    Case {
+        name: "losses_are_exact",
+        devices: lossy,
+        run: losses_are_exact,
+    },
+    Case {
+        name: "a_stall_costs_no_block",
+        devices: stalling,
+        run: a_stall_costs_no_block,
+    },
+    Case {
+        name: "slow_control_is_waited_for",
+        devices: slow_control,
+        run: slow_control_is_waited_for,
+    },
+    Case {
+        name: "what_is_wrong_is_told",
+        devices: wrong,
+        run: what_is_wrong_is_told,
+    },
+    Case {
+        name: "other_devices_are_refused",
+        devices: sound,
+        run: other_devices_are_refused,
+    },
+    Case {
+        name: "unplugged_in_a_scan_and_back",
+        devices: sound,
+        run: unplugged_in_a_scan_and_back,
+    },
+    Case {
+        name: "the_laser_goes_off",
+        devices: sound,
+        run: the_laser_goes_off,
+    },
+    Case {
+        name: "blocks_of_several_lines",
+        devices: several_lines,
+        run: blocks_of_several_lines,
+    },
+    Case {
+        name: "features_that_cannot_be_set",
+        devices: sound,
+        run: features_that_cannot_be_set,
+    },
+    Case {
+        name: "the_example_cells_open",
+        devices: examples,
+        run: the_example_cells_open,
+    },
+    Case {
+        name: "itn_reads_a_gauge",
+        devices: gauges,
+        run: itn_reads_a_gauge,
+    },
+    Case {
+        name: "itn_losses_are_exact",
+        devices: bad_gauges,
+        run: itn_losses_are_exact,
+    },
+    Case {
+        name: "itn_refusal_and_unplugging",
+        devices: stubborn_gauge,
+        run: itn_refusal_and_unplugging,
+    },
+];
+
+const SERIAL: &str = "SN-0042";
+
+fn wave(misdeeds: Misdeeds) -> Device {
+    Device::U3v(Box::new(u3v::Setup {
+        misdeeds,
+        ..u3v::Setup::new(SERIAL, Surface::Wave(320))
+    }))
+}
+
+fn sound() -> Vec<Device> {
+    vec![wave(Misdeeds::default())]
+}
+
+fn setup(driver: &str, table: &str) -> Box<dyn Setup> {
+    let driver = ALL
+        .iter()
+        .find(|known| known.name == driver)
+        .expect("a driver");
+    let table = toml::from_str(table).expect("the test's TOML");
+    (driver.configure)(table).unwrap_or_else(|mistakes| panic!("{mistakes:?}"))
+}
+
+fn text(error: &DeviceError) -> String {
+    let mut text = error.to_string();
+    let mut inner = std::error::Error::source(error);
+    while let Some(source) = inner {
+        text = format!("{text}: {source}");
+        inner = source.source();
+    }
+    text
+}
+
+fn open_with(rig: &dyn Rig, driver: &str, table: &str) -> Result<Box<dyn Profiler>, DeviceError> {
+    match setup(driver, table).open(rig.links())? {
+        Instrument::Profiler(profiler) => Ok(profiler),
+        Instrument::Probe(_) => panic!("a probe"),
+    }
+}
+
+fn open(rig: &dyn Rig, more: &str) -> Box<dyn Profiler> {
+    let table = format!("usb_serial = '{SERIAL}'\nfirst_block = 0\n{more}");
+    open_with(rig, "u3v-profiler", &table).unwrap_or_else(|error| panic!("{}", text(&error)))
+}
+
+fn scan(profiler: &mut dyn Profiler, n: usize) -> Result<Vec<Profile>, DeviceError> {
+    profiler.start()?;
+    let mut profiles = Vec::new();
+    while profiles.len() < n {
+        let profile = profiler.next(Instant::now() + SOON)?;
+        profiles.push(profile.expect("a profile in time"));
+    }
+    profiles.extend(profiler.stop()?);
+    Ok(profiles)
+}
+
+// ---- USB3 Vision ------------------------------------------------------------------------------------------------------
+
+fn view() -> View {
+    DemoCell::new(5).sensors[0].view.clone()
+}
+
+fn scenes() -> Vec<Device> {
+    [
+        (false, false, false),
+        (true, false, true),
+        (false, true, false),
+    ]
+    .map(|(zipped, big_chunks, leader_50)| {
+        Device::U3v(Box::new(u3v::Setup {
+            zipped,
+            big_chunks,
+            blocks: 60,
+            misdeeds: Misdeeds {
+                leader_50,
+                ..Misdeeds::default()
+            },
+            ..u3v::Setup::new(SERIAL, Surface::View(Box::new(view())))
+        }))
+    })
+    .to_vec()
+}
+
+fn every_line_is_the_scene(rig: &dyn Rig, variant: usize) {
+    let order = if variant == 2 { "big" } else { "little" };
+    let view = view();
+    for format in ["Coord3D_ABC32f", "Coord3D_C16"] {
+        let features = format!("features = [['PixelFormat', '{format}'], ['ExposureTime', 250.5]]");
+        let mut profiler = open(
+            rig,
+            &format!("{features}\nchunk_order = '{order}'\nserial_number = '{SERIAL}'"),
+        );
+        let identity = profiler.identity().clone();
+        assert_eq!(
+            (identity.vendor.as_str(), identity.serial.as_str()),
+            ("Simulated Metrology", SERIAL)
+        );
+        let profiles = scan(profiler.as_mut(), 60).expect("a scan");
+        assert_eq!(profiles.len(), 60);
+        let mut seen = 0;
+        for (index, profile) in profiles.iter().enumerate() {
+            let truth = view.line(index as u32);
+            assert_eq!(profile.sequence, index as u32);
+            assert_eq!(profile.encoder, Some(truth.encoder));
+            assert_eq!(
+                profile.device_time_ns,
+                1_000_000_007 + 200_000 * index as u64
+            );
+            assert_eq!(profile.x_mm.len(), truth.x_mm.len());
+            for (i, (x, z)) in profile.x_mm.iter().zip(&profile.z_mm).enumerate() {
+                assert!(x.is_finite());
+                if format == "Coord3D_ABC32f" {
+                    // A float of 250 mm has a last place of 15 nm.
+                    assert!((x - truth.x_mm[i]).abs() < 2e-5, "{x} {}", truth.x_mm[i]);
+                    assert!(
+                        z.is_nan() == truth.z_mm[i].is_nan()
+                            && (z.is_nan() || (z - truth.z_mm[i]).abs() < 2e-5)
+                    );
+                } else if !z.is_nan() {
+                    seen += 1;
+                    let on_line =
+                        truth
+                            .x_mm
+                            .windows(2)
+                            .zip(truth.z_mm.windows(2))
+                            .any(|(xs, zs)| {
+                                // Half a count of 2 um.
+                                let between = |v: f64, pair: &[f64], e: f64| {
+                                    v >= pair[0].min(pair[1]) - e && v <= pair[0].max(pair[1]) + e
+                                };
+                                between(*x, xs, 1e-9) && between(*z, zs, 0.001_001)
+                            });
+                    assert!(on_line, "line {index}: {x} {z}");
+                }
+            }
+        }
+        assert!(format == "Coord3D_ABC32f" || seen > 500, "{seen} points");
+        assert_eq!(rig.number("laser"), 0);
+    }
+}
+
+fn lossy() -> Vec<Device> {
+    let one = |change: fn(&mut Misdeeds)| {
+        let mut misdeeds = Misdeeds::default();
+        change(&mut misdeeds);
+        wave(misdeeds)
+    };
+    vec![
+        one(|_| ()),
+        one(|m| m.gap = 0.1),
+        one(|m| m.short = 0.1),
+        one(|m| m.no_leader = 0.1),
+        one(|m| m.no_trailer = 0.1),
+        one(|m| m.discarded = 0.1),
+        one(|m| m.zero_packets = 0.5),
+        wave(Misdeeds {
+            gap: 0.05,
+            short: 0.05,
+            no_leader: 0.05,
+            no_trailer: 0.05,
+            discarded: 0.05,
+            zero_packets: 0.1,
+            ..Misdeeds::default()
+        }),
+    ]
+}
+
+fn losses_are_exact(rig: &dyn Rig, _: usize) {
+    let mut profiler = open(rig, "");
+    let profiles = scan(profiler.as_mut(), 500).expect("a scan");
+    let truth = rig.truth();
+    let sent: BTreeSet<u64> = truth["sent"]
+        .split(',')
+        .map(|n| n.parse().expect("a number"))
+        .collect();
+    let received: Vec<u64> = profiles.iter().map(|p| p.sequence.into()).collect();
+    assert!(received.is_sorted_by(|a, b| a < b), "in order, none twice");
+    assert_eq!(received.iter().copied().collect::<BTreeSet<_>>(), sent);
+    let losses = profiler.losses();
+    assert_eq!(losses.received, received.len() as u64);
+    let taken: u64 = truth["taken"].parse().expect("a number");
+    let accounted = losses.received + losses.lost_on_link + losses.dropped_by_device;
+    let last = received.last().copied().expect("a profile");
+    // Of blocks behind the last sound one, those that were lost without a trace have no successor that tells.
+    assert!(
+        accounted > last && accounted <= taken,
+        "{last} {accounted} {taken} {losses:?}"
+    );
+    let discarded: u64 = truth["discarded"].parse().expect("a number");
+    assert_eq!(losses.dropped_by_device, discarded);
+}
+
+fn stalling() -> Vec<Device> {
+    let at = |stall_at| {
+        wave(Misdeeds {
+            stall_at,
+            ..Misdeeds::default()
+        })
+    };
+    vec![
+        at(Some(0)),
+        at(Some(50)),
+        wave(Misdeeds {
+            stall_for_ever: true,
+            ..Misdeeds::default()
+        }),
+    ]
+}
+
+fn a_stall_costs_no_block(rig: &dyn Rig, variant: usize) {
+    let mut profiler = open(rig, "");
+    if variant == 2 {
+        let error = scan(profiler.as_mut(), 10).expect_err("a stall for ever");
+        assert_eq!(
+            text(&error),
+            format!(
+                "usb:{SERIAL}: cannot be used: the device refuses the transfer (stall); reopen it"
+            )
+        );
+        return;
+    }
+    let profiles = scan(profiler.as_mut(), 200).expect("a scan");
+    assert_eq!(profiler.losses().lost_on_link, 0);
+    assert_eq!(profiles.len() as u64, rig.number("sent_count"));
+}
+
+fn slow_control() -> Vec<Device> {
+    vec![
+        wave(Misdeeds {
+            pending_ms: Some(300),
+            ..Misdeeds::default()
+        }),
+        wave(Misdeeds {
+            stale_acks: true,
+            ..Misdeeds::default()
+        }),
+        wave(Misdeeds {
+            lose_acks: 2,
+            ..Misdeeds::default()
+        }),
+    ]
+}
+
+fn slow_control_is_waited_for(rig: &dyn Rig, _: usize) {
+    let mut profiler = open(rig, "");
+    assert!(scan(profiler.as_mut(), 20).expect("a scan").len() >= 20);
+}
+
+fn wrong() -> Vec<Device> {
+    vec![
+        wave(Misdeeds {
+            mute: true,
+            ..Misdeeds::default()
+        }),
+        wave(Misdeeds {
+            babble: true,
+            ..Misdeeds::default()
+        }),
+        wave(Misdeeds {
+            lying_file: Some(1 << 40),
+            ..Misdeeds::default()
+        }),
+        wave(Misdeeds {
+            lying_file: Some(1 << 20),
+            ..Misdeeds::default()
+        }),
+        wave(Misdeeds {
+            lying_file: Some(100),
+            ..Misdeeds::default()
+        }),
+    ]
+}
+
+fn what_is_wrong_is_told(rig: &dyn Rig, variant: usize) {
+    let error = open_with(rig, "u3v-profiler", "")
+        .err()
+        .expect("nothing that opens");
+    let told = text(&error);
+    let expected = [
+        "usb:any: no answer within 1.5 s; check power and cable, then retry",
+        "usb:any: 120 bytes came within 1.5 s, but no answer to ReadMem; check `driver` and `baud`",
+        "usb:any: bad data from the device: size of the GenICam file of manifest is 1099511627776, allowed is 1 to 16777216 bytes",
+        "usb:any: ReadMem is refused: invalid address (0x8003); check the configuration against the device's manual, then reopen it",
+        "usb:any: bad data from the device: the line \"GenICam file: ",
+    ][variant];
+    match variant {
+        0 | 1 => assert_eq!(told, expected),
+        _ => assert!(told.starts_with(expected), "{told}"),
+    }
+}
+
+fn other_devices_are_refused(rig: &dyn Rig, _: usize) {
+    let told = |table: &str| {
+        let error = open_with(rig, "u3v-profiler", table).err();
+        text(&error.expect("nothing that opens"))
+    };
+    let absent = "cannot be used: nothing of this name is there; check cable, power and the name";
+    assert_eq!(told("usb_serial = 'SN-1'"), format!("usb:SN-1: {absent}"));
+    assert_eq!(
+        told("usb_id = '1209:0004'"),
+        format!("usb:1209:0004: {absent}")
+    );
+    assert_eq!(
+        told("serial_number = 'ANOTHER'"),
+        format!(
+            "usb:any: answers as \"{SERIAL}\", the configuration expects \"ANOTHER\"; check which device is plugged in where"
+        )
+    );
+    assert!(open_with(rig, "u3v-profiler", "usb_id = '1209:0003'").is_ok());
+}
+
+fn unplugged_in_a_scan_and_back(rig: &dyn Rig, _: usize) {
+    let mut profiler = open(rig, "");
+    profiler.start().expect("a start");
+    assert!(
+        profiler
+            .next(Instant::now() + SOON)
+            .expect("a link")
+            .is_some()
+    );
+    rig.order("unplug");
+    let unplugged = Instant::now();
+    let error = loop {
+        match profiler.next(Instant::now() + SOON) {
+            Ok(profile) => assert!(profile.is_some(), "nobody noticed"),
+            Err(error) => break error,
+        }
+    };
+    assert!(unplugged.elapsed() < Duration::from_secs(10));
+    assert!(error.may_pass());
+    assert_eq!(
+        text(&error),
+        format!(
+            "usb:{SERIAL}: cannot be used: it is gone: closed or unplugged; plug it in again and reopen"
+        )
+    );
+    drop(profiler);
+    let error = open_with(rig, "u3v-profiler", "")
+        .err()
+        .expect("nothing there");
+    assert!(error.may_pass(), "{}", text(&error));
+    rig.order("replug");
+    let mut profiler = open(rig, "");
+    let profiles = scan(profiler.as_mut(), 20).expect("a scan after plugging in again");
+    assert_eq!(profiles[0].sequence, 0);
+}
+
+fn the_laser_goes_off(rig: &dyn Rig, _: usize) {
+    let mut profiler = open(rig, "");
+    profiler.start().expect("a start");
+    assert_eq!(rig.number("laser"), 1);
+    profiler.stop().expect("a stop");
+    assert_eq!(rig.number("laser"), 0, "after stop");
+    profiler.start().expect("a start");
+    drop(profiler);
+    assert_eq!(rig.number("laser"), 0, "after drop");
+    // A host that died left it on: the next one to open it switches it off.
+    let mut profiler = open(rig, "");
+    profiler.start().expect("a start");
+    std::mem::forget(profiler);
+    let _again = open(rig, "");
+    assert_eq!(rig.number("laser"), 0, "after reopening");
+}
+
+fn several_lines() -> Vec<Device> {
+    let device = |lines| {
+        Device::U3v(Box::new(u3v::Setup {
+            lines,
+            blocks: 50,
+            ..u3v::Setup::new(SERIAL, Surface::Wave(100))
+        }))
+    };
+    vec![device(8), device(8)]
+}
+
+fn blocks_of_several_lines(rig: &dyn Rig, variant: usize) {
+    let mut profiler = open(rig, ["encoder_step = 10", ""][variant]);
+    let profiles = scan(profiler.as_mut(), 400).expect("a scan");
+    assert_eq!(profiles.len(), 400);
+    for (index, profile) in profiles.iter().enumerate() {
+        assert_eq!(profile.sequence, index as u32);
+        let known = variant == 0 || index % 8 == 0;
+        assert_eq!(
+            profile.encoder,
+            known.then_some(10 * index as i64),
+            "line {index}"
+        );
+    }
+}
+
+fn features_that_cannot_be_set(rig: &dyn Rig, _: usize) {
+    let told = |features: &str| {
+        let error = open_with(rig, "u3v-profiler", &format!("features = [{features}]")).err();
+        text(&error.expect("nothing that opens"))
+    };
+    assert_eq!(
+        told("['PixelFormat', 'Mono8']"),
+        "usb:any: setting PixelFormat is refused: it has no value Word(\"Mono8\"); look the values up in the device's manual and change `features`"
+    );
+    assert!(told("['Nothing', 1]").contains("GenICam feature Nothing: no such feature"));
+    assert!(told("['Derived', 1]").contains("a IntSwissKnife without a value that is understood"));
+}
+
+// ---- USB-ITN ----------------------------------------------------------------------------------------------------------
+
+fn gauge(change: impl FnOnce(&mut InputTool)) -> Device {
+    let mut tool = InputTool::new("70412345", vec![-1234, 0, 5, 123_456]);
+    change(&mut tool);
+    Device::Itn(tool)
+}
+
+fn gauges() -> Vec<Device> {
+    vec![gauge(|_| ()), gauge(|tool| tool.form = Form::Nibbles)]
+}
+
+fn open_gauge(rig: &dyn Rig, more: &str) -> Result<Box<dyn Profiler>, DeviceError> {
+    open_with(rig, "usb-itn", &format!("interval_s = 0.02\n{more}"))
+}
+
+fn itn_reads_a_gauge(rig: &dyn Rig, _: usize) {
+    let mut profiler =
+        open_gauge(rig, "invert = true").unwrap_or_else(|error| panic!("{}", text(&error)));
+    assert_eq!(rig.number("raw"), 1);
+    let profiles = scan(profiler.as_mut(), 8).expect("readings");
+    for (index, profile) in profiles.iter().enumerate() {
+        let expected = [1.234, 0.0, -0.005, -123.456][index % 4];
+        assert!(
+            (profile.z_mm[0] - expected).abs() < 1e-9,
+            "{index}: {:?}",
+            profile.z_mm
+        );
+        assert_eq!(
+            (profile.sequence, profile.x_mm.as_slice()),
+            (index as u32, &[0.0][..])
+        );
+    }
+    assert_eq!(profiler.losses().received, rig.number("asked"));
+    // The button sends a value that nobody asked for: it is no reading of the run.
+    rig.order("press");
+    profiler.start().expect("a start");
+    while profiler.losses().rejected == 0 && profiler.losses().received < 100 {
+        profiler.next(Instant::now() + SOON).expect("a link");
+    }
+    assert!(profiler.losses().received + profiler.losses().rejected > 0);
+}
+
+fn bad_gauges() -> Vec<Device> {
+    let with = |misdeeds| gauge(|tool| tool.misdeeds = misdeeds);
+    vec![
+        with(usb_itn::Misdeeds {
+            mute_every: Some(3),
+            ..usb_itn::Misdeeds::default()
+        }),
+        with(usb_itn::Misdeeds {
+            garble_every: Some(3),
+            ..usb_itn::Misdeeds::default()
+        }),
+        with(usb_itn::Misdeeds {
+            stall_at: Some(2),
+            ..usb_itn::Misdeeds::default()
+        }),
+    ]
+}
+
+fn itn_losses_are_exact(rig: &dyn Rig, _: usize) {
+    let mut profiler = open_gauge(rig, "").unwrap_or_else(|error| panic!("{}", text(&error)));
+    scan(profiler.as_mut(), 4).expect("readings");
+    let losses = profiler.losses();
+    assert_eq!(losses.lost_on_link, 1, "{losses:?}");
+    assert_eq!(losses.received + losses.lost_on_link, rig.number("asked"));
+}
+
+fn stubborn_gauge() -> Vec<Device> {
+    vec![gauge(|tool| tool.misdeeds.refuse = true), gauge(|_| ())]
+}
+
+fn itn_refusal_and_unplugging(rig: &dyn Rig, variant: usize) {
+    if variant == 0 {
+        let error = open_gauge(rig, "usb_serial = '70412345'")
+            .err()
+            .expect("a refusal");
+        assert_eq!(
+            text(&error),
+            "usb:70412345: cannot be used: the device refuses the transfer (stall); reopen it"
+        );
+        return;
+    }
+    let mut profiler = open_gauge(rig, "").unwrap_or_else(|error| panic!("{}", text(&error)));
+    profiler.start().expect("a start");
+    rig.order("unplug");
+    let error = loop {
+        match profiler.next(Instant::now() + SOON) {
+            Ok(_) => {}
+            Err(error) => break error,
+        }
+    };
+    assert!(text(&error).ends_with("it is gone: closed or unplugged; plug it in again and reopen"));
+    rig.order("replug");
+    assert!(open_gauge(rig, "").is_ok());
+}
+
+// ---- Examples ---------------------------------------------------------------------------------------------------------
+
+fn examples() -> Vec<Device> {
+    vec![wave(Misdeeds::default()), gauge(|_| ())]
+}
+
+/// The example cells under configs/: each opens its device.
+fn the_example_cells_open(rig: &dyn Rig, variant: usize) {
+    let driver = ["u3v-profiler", "usb-itn"][variant];
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join(format!("../configs/{driver}/cell.toml"));
+    let read = std::fs::read_to_string(path).expect("an example cell");
+    let cell: toml::Table = read.parse().expect("TOML");
+    let devices = cell["device"].as_array().expect("devices");
+    let device = devices
+        .iter()
+        .find(|device| device["driver"].as_str() == Some(driver));
+    let mut table = device
+        .and_then(|device| device.as_table())
+        .expect("its device")
+        .clone();
+    table.retain(|key, _| !["name", "driver", "calibration"].contains(&key));
+    let mut profiler = open_with(rig, driver, &table.to_string())
+        .unwrap_or_else(|error| panic!("{}", text(&error)));
+    assert!(scan(profiler.as_mut(), 3).expect("a scan").len() >= 3);
+}
