@@ -49,7 +49,8 @@ fn decoders() {
         acies_simulators::optoncdt::desk(acies_simulators::optoncdt::Setup::new("S", 1));
     desk.write(b"OUTPUT RS422\r\n");
     let mut words = Vec::new();
-    while let Some(bytes) = desk.read(Duration::from_secs(65)) {
+    // One turn of the counter, so that the stream goes on where it begins anew.
+    while let Some(bytes) = desk.read(Duration::from_micros(65_535_900)) {
         words.extend(bytes);
     }
     let mut decoder = optoncdt::Decoder::default();

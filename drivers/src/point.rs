@@ -161,6 +161,8 @@ pub struct Sequencer<T> {
     next: Option<u64>,
     /// When the last value came that was believed.
     last: Option<Instant>,
+    /// Number of the first value, and when it came.
+    first: Option<(u64, Instant)>,
     held: Option<(u64, Instant, T)>,
     /// Values missing between those that came.
     pub lost: u64,
@@ -178,6 +180,7 @@ impl<T> Sequencer<T> {
             rate_hz,
             next: None,
             last: None,
+            first: None,
             held: None,
             lost: 0,
             rejected: 0,
@@ -205,6 +208,7 @@ impl<T> Sequencer<T> {
             each(next + gap, held_item);
             self.next = Some(next + gap + 1);
             self.last = Some(held_at);
+            self.first = self.first.or(Some((next + gap, held_at)));
         } else {
             self.rejected += 1;
             self.lost += u64::from(self.next.is_none());
@@ -251,7 +255,8 @@ impl<T> Sequencer<T> {
         Some(since * self.rate_hz?)
     }
 
-    /// A jump that no time has passed for. Two seconds are granted for a host that was busy while bytes waited.
+    /// A jump back, or one ahead of what the whole run had time for: bytes may wait for a busy host, but never come early. A second
+    /// is granted for those that waited before the first value was read.
     fn goes_back(&self, ahead: u64, at: Instant) -> bool {
         let half = self.period / 2;
         let (Some(expected), Some(rate)) = (self.expected_since(at), self.rate_hz) else {
@@ -261,10 +266,12 @@ impl<T> Sequencer<T> {
             // It may stand anywhere by now.
             return false;
         }
-        if ahead >= half {
-            return true;
-        }
-        ahead as f64 > 1.5 * expected + 2.0 * rate
+        let (Some(next), Some((first, began))) = (self.next, self.first) else {
+            return ahead >= half;
+        };
+        let time_s = at.saturating_duration_since(began).as_secs_f64();
+        let all = (next + ahead).saturating_sub(first) as f64;
+        ahead >= half || all > (1.1 * time_s + 1.0) * rate
     }
 
     /// Values of whole turns of the counter that went by unseen.

@@ -25,6 +25,8 @@
 //! # pitch_mm = 10.0             # from one channel to the next along x, for several
 //! first_mm = 0.0                # x of the first
 //! # unit = "mm"                 # "mm" or "inch", for a dialect whose lines do not tell it
+//! # width = 9                   # characters of a reading, where the gauge always sends as many ("sylvac-opto-rs"): only then is a
+//!                               # lost digit noticed
 //! # question = "\u0002"         # what asks for a reading, where it is not the dialect's own
 //! rate_hz = 10.0                # how often it is asked
 //! reply_s = 0.5                 # how long an answer is waited for
@@ -70,6 +72,7 @@ struct Settings {
     pitch_mm: f64,
     first_mm: f64,
     mm_per_unit: f64,
+    width: Option<usize>,
     question: Option<String>,
     every: Duration,
     reply: Duration,
@@ -161,6 +164,14 @@ fn configure(table: toml::Table) -> Configured {
     if unit.is_some() && dialect == Dialect::HeidenhainNd {
         keys.wrong("unit", "given", "none: its lines tell it");
     }
+    let width = keys.integer("width", 3..=16);
+    if width.is_some() && dialect != Dialect::SylvacOptoRs {
+        keys.wrong(
+            "width",
+            "given",
+            "none: the lines of this dialect have one width",
+        );
+    }
     let question = keys.text("question");
     let rate_hz = keys.number("rate_hz", 0.001..=1000.0).unwrap_or(10.0);
     let reply_s = keys.number("reply_s", 0.01..=60.0).unwrap_or(0.5);
@@ -181,6 +192,7 @@ fn configure(table: toml::Table) -> Configured {
         pitch_mm: pitch.unwrap_or(0.0),
         first_mm,
         mm_per_unit: unit.unwrap_or(1.0),
+        width: width.map(|width| width as usize),
         question,
         every: Duration::from_secs_f64(1.0 / rate_hz),
         reply: Duration::from_secs_f64(reply_s),
@@ -271,6 +283,16 @@ struct Run {
     heard_before: u64,
 }
 
+/// A number in a line of another width has lost a digit.
+fn of_width(width: Option<usize>, text: &str, event: Event) -> Event {
+    match (width, &event) {
+        (Some(width), Ok(Line::One(_, Reading::Number { .. }))) if width != text.len() => {
+            Err(DecodeError::Line { line: text.into() })
+        }
+        _ => event,
+    }
+}
+
 /// A line, or why it is none.
 type Event = Result<Line, DecodeError>;
 
@@ -303,9 +325,10 @@ impl Gauge {
             self.heard_bytes += n as u64;
             let dialect = self.settings.dialect;
             let (account, fresh) = (&mut self.account, &mut self.fresh);
+            let width = self.settings.width;
             self.assembler.take(&buffer[..n], |text| {
                 let (text, event) = match text {
-                    Ok(text) => (text, line(dialect, text)),
+                    Ok(text) => (text, of_width(width, text, line(dialect, text))),
                     Err(error) => ("", Err(error)),
                 };
                 *fresh |= event == Ok(Line::SwitchedOn);

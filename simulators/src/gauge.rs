@@ -187,11 +187,10 @@ impl Gauge {
         self.readings += 1;
         let faults = self.core.faults.clone();
         if self.core.happens(faults.chatter) {
-            // somebody pushed the button, or the mains dipped
+            // somebody pushed the button just before
             let unasked = match self.setup.dialect {
                 Dialect::Keyence => "DR,+00.000\r\n".to_owned(),
-                Dialect::Sylvac => "SY235\r".to_owned(),
-                _ => "\r\n".to_owned(),
+                _ => text[before.len()..].to_owned(),
             };
             text.insert_str(0, &unasked);
         }

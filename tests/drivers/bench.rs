@@ -196,7 +196,7 @@ pub fn benches() -> Vec<Bench> {
             restart: Some("the gauge was switched off and on"),
             ..of_gauge(
                 "sylvac",
-                "dialect = 'sylvac-opto-rs'\nrate_hz = 1000",
+                "dialect = 'sylvac-opto-rs'\nwidth = 9\nrate_hz = 1000",
                 |cell, wire| gauge(Dialect::Sylvac, 1, cell, wire),
             )
         },

@@ -27,7 +27,7 @@ pub struct Word {
     pub first: bool,
     /// The value.
     pub value: u32,
-    /// No byte was thrown away between it and the word or reply before.
+    /// No byte was thrown away between it and the word before; a reply may stand there.
     pub clean: bool,
 }
 
@@ -37,7 +37,7 @@ pub struct Decoder {
     /// Bytes without bit 7 since the last word or reply.
     pending: Vec<u8>,
     skipped_bytes: u64,
-    /// As it stood at the last word or reply.
+    /// As it stood at the last word.
     skipped_before: u64,
     doubted: u64,
 }
@@ -57,6 +57,19 @@ fn word(low: u8, middle: u8, high: u8, clean: bool) -> Word {
         value: six(low) | six(middle) << 6 | six(high) << 12,
         clean,
     }
+}
+
+/// Where a reply begins: behind the last byte that is no text, with a letter or an empty line. What stands before is left of
+/// words that were damaged.
+fn text_start(bytes: &[u8]) -> usize {
+    let is_text = |b: &u8| (0x20..0x7F).contains(b) || matches!(b, b'\r' | b'\n' | b'\t');
+    let behind = bytes
+        .iter()
+        .rposition(|b| !is_text(b))
+        .map_or(0, |at| at + 1);
+    let begins = |b: &u8| b.is_ascii_alphabetic() || matches!(b, b'\r' | b'\n');
+    let first = bytes[behind..].iter().position(begins);
+    first.map_or(bytes.len(), |first| behind + first)
 }
 
 impl Decoder {
@@ -89,8 +102,9 @@ impl Decoder {
         if byte & 0x80 == 0 {
             self.pending.push(byte);
             if self.pending.ends_with(b"->") {
-                self.skipped_before = self.skipped_bytes;
-                each(Item::Reply(&self.pending[..n - 1]));
+                let start = text_start(&self.pending[..n - 1]);
+                self.skipped_bytes += start as u64;
+                each(Item::Reply(&self.pending[start..n - 1]));
                 self.pending.clear();
             } else if n + 1 == TEXT_MAX {
                 self.skipped_bytes += TEXT_MAX as u64;
@@ -338,6 +352,22 @@ mod tests {
             }
         });
         assert_eq!(found, [[1000, 0]]);
+    }
+
+    #[test]
+    fn a_reply_behind_damaged_words_joins_no_distance_to_a_later_counter() {
+        let mut bytes = encode(true, 1000).to_vec();
+        // Zeros in place of the counter 0 and the distance 1, then a reply and the counter 1.
+        bytes.extend([0; 6]);
+        bytes.extend(b"W320 Temperature\r\n->");
+        bytes.extend(encode(false, 1));
+        let mut decoder = Decoder::default();
+        let mut assembly = Assembly::new(2);
+        decoder.take(&bytes, |item| match item {
+            Item::Word(word) => assert_eq!(assembly.take(word), None),
+            Item::Reply(text) => assert_eq!(text, b"W320 Temperature\r\n"),
+        });
+        assert_eq!(decoder.skipped_bytes(), 6);
     }
 
     #[test]

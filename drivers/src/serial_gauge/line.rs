@@ -242,7 +242,11 @@ fn keyence(text: &str) -> Option<Line> {
     }
 }
 
+/// Sign, five digits and a point, wherever the amplifier has it; or a word of the same length.
 fn keyence_value(text: &str) -> Option<Reading> {
+    if text.len() != 7 && !text.ends_with("FFFFFFF") {
+        return None;
+    }
     Some(match text {
         "-99.998" | "-999.98" | "-9999.8" => Reading::Absent("not settled yet"),
         "+EE.EEE" | "+EEE.EE" | "+EEEE.E" => Reading::Absent("error of the amplifier"),
@@ -347,6 +351,7 @@ mod tests {
             assert!(line(Dialect::SylvacOptoRs, text).is_err(), "{text:?}");
         }
         assert!(line(Dialect::KeyenceDlRs1a, "M0,+12.345,").is_err());
+        assert!(line(Dialect::KeyenceDlRs1a, "M0,+2.345").is_err());
         assert!(line(Dialect::HeidenhainNd, "-      5.23 µ=").is_err());
     }
 
