@@ -15,7 +15,7 @@ use acies::geometry::RigidTransform;
 use acies::inspect::align::{AlignOptions, Aligned, Conclusion, Scan, Start, align};
 use acies::inspect::assign::Surface;
 use acies::nominal::{Nominal, SurfaceSample};
-use acies::points::{Frame, Neighbors, Origin, PointCloud, View, noise_mm, spacing};
+use acies::points::{Frame, Neighbors, Origin, PointCloud, Spacing, View, noise_mm, spacing};
 use glam::{DMat3, DVec3};
 
 #[allow(dead_code, reason = "the scans of exact solids serve the tests")]
@@ -211,24 +211,27 @@ fn figure(mode: &str, name: &str, nominal: &Nominal, settings: &Settings) {
     for start_mode in starts {
         let mut tally = Tally::default();
         let mut noise = Noise(77);
-        let mut made: Option<(Made, Neighbors)> = None;
+        let mut made: Option<(Made, Neighbors, Spacing, f64)> = None;
         for k in 0..settings.starts {
             if k % STARTS_OF_A_CLOUD == 0 {
                 let side = (mode == "side").then(|| noise.direction());
                 let new = make(nominal, settings.points, k as u64 + 1, side, false);
+                let clock = Instant::now();
                 let neighbors = Neighbors::new(&new.cloud.positions);
-                made = Some((new, neighbors));
+                let scan = scan_of(&new, &neighbors);
+                tally.before.push(clock.elapsed().as_secs_f64());
+                let (spacing, noise_mm) = (scan.spacing, scan.noise_mm);
+                made = Some((new, neighbors, spacing, noise_mm));
             }
-            let Some((made, neighbors)) = &made else {
+            let Some((made, neighbors, spacing, noise_mm)) = &made else {
                 continue;
             };
-            if k % STARTS_OF_A_CLOUD == 0 {
-                let clock = Instant::now();
-                let tree = Neighbors::new(&made.cloud.positions);
-                scan_of(made, &tree);
-                tally.before.push(clock.elapsed().as_secs_f64());
-            }
-            let scan = scan_of(made, neighbors);
+            let scan = Scan {
+                cloud: &made.cloud,
+                neighbors,
+                spacing: *spacing,
+                noise_mm: *noise_mm,
+            };
             let start = match start_mode {
                 "auto" => Start::Auto,
                 _ => Start::Rough(off(&made.part_from_machine, nominal, &mut noise)),

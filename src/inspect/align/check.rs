@@ -15,8 +15,9 @@ use crate::inspect::result::Verdict;
 /// Share of the points near the nominal that must lie on it; the rest may be burrs, reflections, a clamp.
 const ON_NOMINAL: f64 = 0.9;
 
-/// Share of the half-diagonal that a face of the right part may be off.
-const FORM: f64 = 0.01;
+/// Share of the half-diagonal that a face of the right part may be off: 0.2 mm of a part of 10 mm. What lies on a face of its direction and
+/// further off was not made by shifting a face.
+const FORM: f64 = 0.04;
 
 /// Points with a normal without which nothing can be said of a pose.
 const ENOUGH: usize = 50;
