@@ -93,10 +93,12 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let options = AlignOptions {
         datum_faces: &datums,
         touches: request.touches,
+        ..AlignOptions::default()
     };
     let Aligned {
         alignment,
         findings: of_alignment,
+        ..
     } = align(&scan, &surface, request.start, &options);
     findings.extend(of_alignment);
 

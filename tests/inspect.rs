@@ -304,7 +304,7 @@ fn a_rough_start_is_refined_to_within_its_covariance() {
             let start = noise.motion(0.15, 1.0) * machine_from_part.inverse();
             let options = AlignOptions {
                 datum_faces: if with_deviations { &datums } else { &[] },
-                touches: &[],
+                ..AlignOptions::default()
             };
             let aligned = align_scan(&solid, &cloud, Start::Rough(start), &options);
             assert_eq!(
@@ -420,8 +420,8 @@ fn touches_hold_what_the_scan_does_not() {
     );
     assert_eq!(without.alignment.status, Verdict::NotDecidable);
     let options = AlignOptions {
-        datum_faces: &[],
         touches: &touches,
+        ..AlignOptions::default()
     };
     let start = noise.motion(0.02, 0.3);
     let with = align_scan(&solid, &cloud, Start::Rough(start), &options);

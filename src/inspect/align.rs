@@ -1,38 +1,61 @@
-//! How a scan lies in the part frame: a least-squares pose on the exact faces of the nominal, with its covariance.
+//! How a scan lies in the part frame: a least-squares pose on the exact faces of the nominal, with its covariance and a
+//! conclusion about itself.
 //!
 //! Points are paired with the foot of their perpendicular on the nearest face that is seen from the sensor's side; the
-//! pose is the robust least-squares solution of the signed distances (Gauss-Newton with Tukey's weights). Then each face
+//! pose is the robust least-squares solution of the signed distances (Gauss-Newton with Tukey's weights), of points away
+//! from edges. A start is found by a search over all poses that what is known leaves open. Then each face
 //! and each patch of a face is asked whether it departs from its nominal by more than noise, and the covariance grows by
-//! what is found. Directions that the data do not hold are left alone and named.
+//! what is found. Directions that the data do not hold are left alone and named; a pose that another one rivals, that leaves
+//! the scan off the nominal, or that fits a mirrored scan better is no answer.
 
+mod check;
+pub mod datum;
+mod form;
+mod scene;
 mod search;
 mod twist;
 
-use std::collections::BTreeMap;
-
-use glam::DVec3;
+use glam::{DMat3, DVec3};
 use nalgebra::{Matrix6, SymmetricEigen, Vector6};
 use rayon::prelude::*;
 
 use super::assign::{NO_FACE, Surface, towards};
 use super::body::Body;
-use super::clusters::SIGNIFICANT;
 use super::measure::pose_row;
 use super::result::{Alignment, Verdict};
 use crate::geometry::RigidTransform;
 use crate::geometry::fit::{mad_sigma, median};
 use crate::points::{Neighbors, PointCloud, Spacing};
+use form::{form, patch_of};
+use scene::Scene;
+use search::Pose;
 
+pub use datum::{Datum, DatumPose, pose_from_datums};
 pub use twist::Twist;
 
-/// Points of the final fit: more do not make the pose better than the form of the faces allows.
-const FINAL_POINTS: usize = 20_000;
+/// Points of the last step: more do not make the pose better than anything else is known.
+const FINAL_POINTS: usize = 1_000_000;
+
+/// Points of the steps before.
+const FINE_POINTS: usize = 20_000;
 
 /// Points of the coarse steps.
 const COARSE_POINTS: usize = 2_000;
 
+/// Observations that one task adds up; fixed, so that the sums do not depend on the number of threads.
+const BLOCK: usize = 8192;
+
 /// Tukey's constant: 95 % efficient on normal noise.
 const TUKEY: f64 = 4.685;
+
+/// Points nearer to an edge than this many spacings along the line may be smeared over it.
+const RIM_SPACINGS: f64 = 3.0;
+
+/// A direction held by fewer than one in this many observations is held by chance.
+const CHANCE: f64 = 1e5;
+
+/// What a held degree of freedom counts over all observations.
+const HELD: f64 = 1e12;
 
 const TOO_FEW: &str = "alignment: fewer than 20 points lie near the nominal, expected most of the scan; give a better start";
 
@@ -41,11 +64,30 @@ const TOO_FEW: &str = "alignment: fewer than 20 points lie near the nominal, exp
 pub enum Start {
     /// The scan lies in the part frame already.
     None,
-    /// Roughly: right to a tenth of the part's size and some 20 degrees.
+    /// Roughly: as far as [`AlignOptions::start_within`] says.
     Rough(RigidTransform),
     /// Nothing.
     #[default]
     Auto,
+}
+
+/// How far a rough start may be off.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StartWithin {
+    /// Turned about the part's middle, rad.
+    pub turn_rad: f64,
+    /// Shifted, over the half-diagonal of the part.
+    pub shift_share: f64,
+}
+
+impl Default for StartWithin {
+    /// 20 degrees and half the part's size.
+    fn default() -> Self {
+        Self {
+            turn_rad: 20f64.to_radians(),
+            shift_share: 1.0,
+        }
+    }
 }
 
 /// One contact of a probe with the part.
@@ -64,6 +106,30 @@ pub struct AlignOptions<'a> {
     pub datum_faces: &'a [u32],
     /// Contacts of a probe, as further observations.
     pub touches: &'a [Touch],
+    /// How far a rough start may be off.
+    pub start_within: StartWithin,
+    /// Degrees of freedom that stay as the rough start has them: of the motion from there, the turns about x, y, z (components of
+    /// the rotation vector about the part origin) and the shifts along x, y, z, in the part frame.
+    pub held: [bool; 6],
+}
+
+/// What an alignment says of itself.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Conclusion {
+    /// The pose is the only one that fits, and the data hold it.
+    Good,
+    /// The scan was taken as it lies.
+    AsGiven,
+    /// Nothing fits, or there is nothing to fit.
+    NotFound,
+    /// The data leave a direction free that moves a sharp edge.
+    Free,
+    /// So many poses fit equally well: a symmetric part, or too little of it seen.
+    Ambiguous(usize),
+    /// Too much of the scan lies off the nominal: another part, another place, or mostly other things.
+    Misfit,
+    /// The mirrored scan fits better.
+    Mirrored,
 }
 
 /// A pose with what is to be said of it.
@@ -73,12 +139,16 @@ pub struct Aligned {
     pub alignment: Alignment,
     /// Why it is not decidable, and what was peculiar.
     pub findings: Vec<String>,
+    /// The finding that rules, for a program.
+    pub conclusion: Conclusion,
+    /// Of the normal matrix, ascending: as many points straight on would hold each principal direction. Turns are counted by
+    /// what they move at the half-diagonal of the part; a held degree of freedom counts as infinite.
+    pub eigenvalues: [f64; 6],
 }
 
 /// The pose of `cloud` on the nominal, from `start`.
 ///
-/// The result is `NotDecidable` where the search failed, where several poses fit equally well, or where the data leave a
-/// direction free that moves a sharp edge.
+/// The result is `NotDecidable` for every [`Conclusion`] but `Good` and `AsGiven`.
 pub fn align<B: Body>(
     scan: &Scan<'_>,
     surface: &Surface<'_, B>,
@@ -89,23 +159,20 @@ pub fn align<B: Body>(
         scan,
         surface,
         options,
-        size_mm: size(surface.body),
+        size_mm: surface.size_mm(),
+        origin: match start {
+            Start::Rough(pose) => pose,
+            _ => RigidTransform::IDENTITY,
+        },
     };
+    let holds = options.held.contains(&true);
     match start {
         Start::None => task.as_it_lies(),
-        Start::Rough(pose) => task.refine_and_judge(pose, Vec::new()),
-        Start::Auto => match search::search(scan, surface) {
-            Some(found) => {
-                let mut aligned = task.refine_and_judge(found.pose, found.findings);
-                if found.ambiguous {
-                    aligned.alignment.status = Verdict::NotDecidable;
-                }
-                aligned
-            }
-            None => task.failed(
-                "alignment: no pose of the scan fits the nominal; give a rough start".to_string(),
-            ),
-        },
+        Start::Auto if holds => task.failed(
+            "alignment: held degrees of freedom but no start, expected the pose they are held at; give a rough start"
+                .to_string(),
+        ),
+        _ => task.find(start, holds),
     }
 }
 
@@ -131,20 +198,37 @@ impl Scan<'_> {
     }
 }
 
-fn size<B: Body>(body: &B) -> f64 {
-    let [low, high] = body.bounds();
-    (0.5 * (high - low).length()).max(1e-9)
-}
-
-/// One observation: the direction in which the pose moves it, its residual and weight, and which face it lies on.
+/// One observation: a place on a face, and how far the point lies off it.
 #[derive(Debug, Clone, Copy)]
 struct Observation {
-    row: [f64; 6],
+    /// In the part frame.
+    point: DVec3,
+    normal: DVec3,
     residual_mm: f64,
     face: u32,
-    point: DVec3,
     /// Of a touch: its own standard deviation; of a scan point 0.
     u_mm: f64,
+}
+
+impl Observation {
+    /// How the pose moves it, turns counted at the half-diagonal, so that all six unknowns are mm.
+    fn scaled_row(&self, size_mm: f64) -> Vector6<f64> {
+        let row = pose_row(self.point, self.normal);
+        Vector6::from_fn(|k, _| if k < 3 { row[k] / size_mm } else { row[k] })
+    }
+}
+
+/// A Gauss-Newton step.
+struct Step {
+    twist: Twist,
+    sigma: f64,
+    weights: Vec<f64>,
+    /// Normal matrix in scaled unknowns.
+    matrix: Matrix6<f64>,
+    /// Its eigenvalues, ascending; those of held degrees of freedom infinite.
+    eigenvalues: [f64; 6],
+    /// Unit vectors, in scaled unknowns, that the data do not hold.
+    weak: Vec<Vector6<f64>>,
 }
 
 struct Task<'a, B: Body> {
@@ -152,6 +236,8 @@ struct Task<'a, B: Body> {
     surface: &'a Surface<'a, B>,
     options: &'a AlignOptions<'a>,
     size_mm: f64,
+    /// The pose at which held degrees of freedom stay.
+    origin: RigidTransform,
 }
 
 impl<B: Body> Task<'_, B> {
@@ -170,13 +256,16 @@ impl<B: Body> Task<'_, B> {
                 status: Verdict::NotDecidable,
             },
             findings: vec![finding],
+            conclusion: Conclusion::NotFound,
+            eigenvalues: [0.0; 6],
         }
     }
 
     /// The identity, taken as exact, with the residuals it leaves.
     fn as_it_lies(&self) -> Aligned {
-        let indices = self.scan.subset(FINAL_POINTS);
-        let observations = self.observe(&RigidTransform::IDENTITY, &indices, 0.1 * self.size_mm);
+        let indices = self.scan.subset(FINE_POINTS);
+        let observations =
+            self.observe(&RigidTransform::IDENTITY, &indices, 0.1 * self.size_mm, 0.0);
         let sum: f64 = observations.iter().map(|o| o.residual_mm.powi(2)).sum();
         Aligned {
             alignment: Alignment {
@@ -188,95 +277,234 @@ impl<B: Body> Task<'_, B> {
                 status: Verdict::Ok,
             },
             findings: Vec::new(),
+            conclusion: Conclusion::AsGiven,
+            eigenvalues: [0.0; 6],
         }
     }
 
-    /// The scan points `indices` on the faces that hold the pose, and the touches.
-    fn observe(&self, pose: &RigidTransform, indices: &[u32], gate_mm: f64) -> Vec<Observation> {
+    /// Searches, follows the best pose down to all points, and judges it.
+    fn find(&self, start: Start, holds: bool) -> Aligned {
+        let scene = Scene::new(self.scan);
+        let mut poses = if holds {
+            Vec::new()
+        } else {
+            search::search(self, &scene, start)
+        };
+        if let Start::Rough(pose) = start {
+            let Some((pose, weak)) = self.coarse(pose, COARSE_POINTS, 0.3 * self.size_mm) else {
+                if poses.is_empty() {
+                    return self.failed(TOO_FEW.to_string());
+                }
+                return self.follow(&scene, poses, start);
+            };
+            let fit = scene.fit(&pose, self.surface, self.cap_mm());
+            let better = poses
+                .first()
+                .is_some_and(|p| p.fit.is_better(&fit, self.scan.noise_mm));
+            // Where several fit the start decides.
+            let place = usize::from(better);
+            poses.insert(place, Pose { pose, fit, weak });
+        }
+        if poses.is_empty() {
+            return self.failed(
+                "alignment: no pose of the scan fits the nominal; give a rough start".to_string(),
+            );
+        }
+        self.follow(&scene, poses, start)
+    }
+
+    /// From the first of `poses` down to all points; the others are its rivals.
+    fn follow(&self, scene: &Scene, poses: Vec<Pose>, start: Start) -> Aligned {
+        let best = poses[0].pose;
+        let Some((pose, _)) = self.coarse(best, COARSE_POINTS, 0.1 * self.size_mm) else {
+            return self.failed(TOO_FEW.to_string());
+        };
+        let Some((pose, observations, step)) = self.fine(pose) else {
+            return self.failed(TOO_FEW.to_string());
+        };
+        let mut aligned = self.described(pose, &observations, &step);
+        self.check(scene, &poses, start, &step, &mut aligned);
+        aligned
+    }
+
+    /// The pose by some points until it stands, then by all.
+    fn fine(&self, start: RigidTransform) -> Option<(RigidTransform, Vec<Observation>, Step)> {
+        let mut pose = start;
+        let some = self.scan.subset(FINE_POINTS);
+        // Wide enough that a face which is off stays in sight and is counted as form.
+        let gate = (0.05 * self.size_mm).max(10.0 * self.scan.noise_mm);
+        let mut rim = (RIM_SPACINGS * self.scan.spacing.along_mm).min(0.02 * self.size_mm);
+        // A part of nothing but narrow faces is all rim.
+        let inner = self.observe(&pose, &some, gate, rim).len();
+        if inner * 3 < self.observe(&pose, &some, gate, 0.0).len() {
+            rim = 0.0;
+        }
+        for _ in 0..12 {
+            let step = self.solve(&self.observe(&pose, &some, gate, rim))?;
+            pose = self.moved(&step.twist, pose);
+            if step.twist.size(self.size_mm) < 0.05 * self.scan.noise_mm.max(1e-8 * self.size_mm) {
+                break;
+            }
+        }
+        let all = self.scan.subset(FINAL_POINTS);
+        let mut last = None;
+        for _ in 0..3 {
+            let observations = self.observe(&pose, &all, gate, rim);
+            let step = self.solve(&observations)?;
+            pose = self.moved(&step.twist, pose);
+            // The steps converge quadratically: what one this small leaves is nothing.
+            let small = step.twist.size(self.size_mm) < self.scan.noise_mm.max(1e-7 * self.size_mm);
+            last = Some((pose, observations, step));
+            if small {
+                break;
+            }
+        }
+        let (pose, mut observations, step) = last?;
+        // What the last step took off them.
+        let v = step.twist.scaled(self.size_mm);
+        let v = Vector6::from_fn(|k, _| v[k]);
+        observations
+            .par_iter_mut()
+            .for_each(|o| o.residual_mm += o.scaled_row(self.size_mm).dot(&v));
+        Some((pose, observations, step))
+    }
+
+    /// `pose` moved by `twist`, held degrees of freedom put back.
+    fn moved(&self, twist: &Twist, pose: RigidTransform) -> RigidTransform {
+        let pose = twist.transform() * pose;
+        if !self.options.held.contains(&true) {
+            return pose;
+        }
+        let motion = pose * self.origin.inverse();
+        let mut free = Twist {
+            turn: Twist::logarithm(&motion).turn,
+            shift: motion.translation,
+        }
+        .to_array();
+        for (x, held) in free.iter_mut().zip(self.options.held) {
+            if held {
+                *x = 0.0;
+            }
+        }
+        Twist::from_array(free).transform() * self.origin
+    }
+
+    /// The scan points `indices` on the faces that hold the pose, away from edges by `rim_mm`, and the touches.
+    fn observe(
+        &self,
+        pose: &RigidTransform,
+        indices: &[u32],
+        gate_mm: f64,
+        rim_mm: f64,
+    ) -> Vec<Observation> {
         let cloud = self.scan.cloud;
+        let turn = DMat3::from_quat(pose.rotation);
         let holds = |face: u32| {
             face != NO_FACE
                 && (self.options.datum_faces.is_empty() || self.options.datum_faces.contains(&face))
         };
-        let of = |point: DVec3, view: Option<DVec3>, u_mm: f64, found: &mut Vec<(u32, f64)>| {
-            let p = pose.point(point);
-            let view = view.map(|v| pose.vector(v));
-            let place = self.surface.place(p, view, gate_mm, found);
-            holds(place.face).then(|| Observation {
-                row: pose_row(p, place.normal),
+        let of = |point: DVec3,
+                  view: Option<DVec3>,
+                  (u_mm, rim_mm): (f64, f64),
+                  found: &mut Vec<(u32, f64)>| {
+            let p = turn * point + pose.translation;
+            let view = view.map(|v| turn * v);
+            let (place, rim) = self.surface.place_and_rim(p, view, gate_mm, found);
+            (holds(place.face) && rim >= rim_mm).then_some(Observation {
+                point: p,
+                normal: place.normal,
                 residual_mm: place.deviation_mm,
                 face: place.face,
-                point: p,
                 u_mm,
             })
         };
         let mut observations: Vec<Observation> = indices
-            .par_iter()
-            .map_init(Vec::new, |found, i| {
-                let i = *i as usize;
-                of(cloud.positions[i], towards(cloud, i), 0.0, found)
+            .par_chunks(BLOCK.min(512))
+            .map_init(Vec::new, |found, block| {
+                let mut out = Vec::with_capacity(block.len());
+                for i in block {
+                    let i = *i as usize;
+                    let view = towards(cloud, i);
+                    out.extend(of(cloud.positions[i], view, (0.0, rim_mm), found));
+                }
+                out
             })
             .flatten_iter()
             .collect();
         let mut found = Vec::new();
         for touch in self.options.touches {
-            observations.extend(of(touch.point, None, touch.u_mm, &mut found));
+            observations.extend(of(touch.point, None, (touch.u_mm, 0.0), &mut found));
         }
         observations
     }
 
-    /// Follows the pose down, coarse to fine, and says how well it is known.
-    fn refine_and_judge(&self, start: RigidTransform, findings: Vec<String>) -> Aligned {
-        let Some((mut pose, _)) = self.coarse(start, (COARSE_POINTS, 30)) else {
-            return self.failed(TOO_FEW.to_string());
-        };
-        let fine = self.scan.subset(FINAL_POINTS);
-        // Wide enough that a face which is off stays in sight and is counted as form.
-        let gate = (0.05 * self.size_mm).max(10.0 * self.scan.noise_mm);
-        let mut last = None;
-        for _ in 0..12 {
-            let observations = self.observe(&pose, &fine, gate);
-            let Some(step) = self.solve(&observations) else {
-                return self.failed(
-                    "alignment: too few points near the nominal; give a better start".to_string(),
-                );
-            };
-            pose = step.twist.transform() * pose;
-            let moved = step.twist.size(self.size_mm);
-            last = Some((observations, step));
-            if moved < 5e-3 * self.scan.noise_mm.max(1e-9 * self.size_mm) {
-                break;
-            }
-        }
-        match last {
-            Some((observations, step)) => self.judge(pose, &observations, &step, findings),
-            None => self.failed("alignment: no step was made".to_string()),
-        }
-    }
-
     /// The pose that a few points settle on from `start`, and the directions that they do not hold.
-    ///
-    /// `effort` is the number of points and of steps at most.
     fn coarse(
         &self,
         start: RigidTransform,
-        effort: (usize, usize),
+        points: usize,
+        gate_mm: f64,
     ) -> Option<(RigidTransform, Vec<Twist>)> {
-        let few = self.scan.subset(effort.0);
+        let few = self.scan.subset(points);
+        self.descend(start, (gate_mm, 30), |pose, gate| {
+            self.observe(pose, &few, gate, 0.0)
+        })
+    }
+
+    /// As [`Task::coarse`] on points of the scene, of which the normals must agree; the start where too few lie near.
+    fn on_scene(
+        &self,
+        scene: &Scene,
+        start: RigidTransform,
+        (points, steps): (usize, usize),
+    ) -> (RigidTransform, Vec<Twist>) {
+        let few = scene.few(points);
+        let descended = self.descend(start, (0.15 * self.size_mm, steps), |pose, gate| {
+            let turn = DMat3::from_quat(pose.rotation);
+            let mut found = Vec::new();
+            let mut observations = Vec::with_capacity(few.len());
+            for o in &few {
+                let p = turn * o.point + pose.translation;
+                let view = o.towards.map(|t| turn * t);
+                let place = self.surface.place(p, view, gate, &mut found);
+                let cosine = place.normal.dot(turn * o.normal);
+                let agrees = if view.is_some() { cosine } else { cosine.abs() } > 0.7;
+                if place.face != NO_FACE && agrees {
+                    observations.push(Observation {
+                        point: p,
+                        normal: place.normal,
+                        residual_mm: place.deviation_mm,
+                        face: place.face,
+                        u_mm: 0.0,
+                    });
+                }
+            }
+            observations
+        });
+        descended.unwrap_or((start, Vec::new()))
+    }
+
+    /// Gauss-Newton steps while the gate narrows to where only the part itself is left: fixtures and reflections lie further away.
+    fn descend(
+        &self,
+        start: RigidTransform,
+        (gate_mm, steps): (f64, usize),
+        observe: impl Fn(&RigidTransform, f64) -> Vec<Observation>,
+    ) -> Option<(RigidTransform, Vec<Twist>)> {
         let mut pose = start;
         let mut weak = Vec::new();
-        let mut gate = 0.3 * self.size_mm;
+        let mut gate = gate_mm;
         let noise = self.scan.noise_mm.max(1e-6 * self.size_mm);
-        // The gate narrows to where only the part itself is left: fixtures and reflections lie further away.
-        for _ in 0..effort.1 {
-            let step = self.solve(&self.observe(&pose, &few, gate))?;
-            pose = step.twist.transform() * pose;
+        for _ in 0..steps {
+            let step = self.solve(&observe(&pose, gate))?;
+            pose = self.moved(&step.twist, pose);
             gate = (0.7 * gate)
                 .max(6.0 * step.sigma)
                 .max(10.0 * noise)
-                .max(0.01 * self.size_mm);
+                .max(0.01 * self.size_mm)
+                .min(gate_mm);
             weak = self.twists(&step);
-            if step.twist.size(self.size_mm) < 0.1 * noise {
+            if step.twist.size(self.size_mm) < 0.2 * noise {
                 break;
             }
         }
@@ -284,11 +512,32 @@ impl<B: Body> Task<'_, B> {
     }
 
     fn twists(&self, step: &Step) -> Vec<Twist> {
-        let scaling = self.scaling();
         step.weak
             .iter()
-            .map(|v| Twist::from_array(std::array::from_fn(|k| v[k] * scaling[k])))
+            .map(|v| Twist::from_scaled(v, self.size_mm))
             .collect()
+    }
+
+    /// Distances count up to this when whole poses are compared, mm.
+    fn cap_mm(&self) -> f64 {
+        0.1 * self.size_mm
+    }
+
+    /// Spread of the residuals: about zero, or about their median where they are all off alike.
+    fn scale(&self, observations: &[Observation]) -> f64 {
+        let every = observations.len().div_ceil(50_000).max(1);
+        let residuals: Vec<f64> = observations
+            .iter()
+            .step_by(every)
+            .map(|o| o.residual_mm)
+            .collect();
+        let mut centred = residuals.clone();
+        let middle = median(&mut centred);
+        let spread: Vec<f64> = residuals.iter().map(|r| r - middle).collect();
+        mad_sigma(&residuals)
+            .min(2.0 * mad_sigma(&spread) + middle.abs())
+            .max(self.scan.noise_mm)
+            .max(1e-9 * self.size_mm)
     }
 
     /// One Gauss-Newton step; `None` for fewer than 20 observations.
@@ -296,129 +545,106 @@ impl<B: Body> Task<'_, B> {
         if observations.len() < 20 {
             return None;
         }
-        let residuals: Vec<f64> = observations.iter().map(|o| o.residual_mm).collect();
-        let mut centred = residuals.clone();
-        let middle = median(&mut centred);
-        let spread: Vec<f64> = residuals.iter().map(|r| r - middle).collect();
-        let scale = mad_sigma(&residuals)
-            .min(2.0 * mad_sigma(&spread) + middle.abs())
-            .max(self.scan.noise_mm)
-            .max(1e-9 * self.size_mm);
+        let scale = self.scale(observations);
         let weight = |o: &Observation| {
             let ratio = o.residual_mm / (TUKEY * scale);
-            let robust = if ratio.abs() < 1.0 {
-                (1.0 - ratio * ratio).powi(2)
-            } else {
-                0.0
-            };
             if o.u_mm > 0.0 {
                 // A touch counts by its own uncertainty, in units of the scan's noise.
                 (scale / o.u_mm).powi(2)
+            } else if ratio.abs() < 1.0 {
+                (1.0 - ratio * ratio).powi(2)
             } else {
-                robust
+                0.0
             }
         };
-        let weights: Vec<f64> = observations.iter().map(weight).collect();
-        let mut matrix = Matrix6::zeros();
+        let add = |block: &[Observation]| {
+            let mut matrix = Matrix6::zeros();
+            let mut right = Vector6::zeros();
+            let mut weights = Vec::with_capacity(block.len());
+            for o in block {
+                let w = weight(o);
+                let row = o.scaled_row(self.size_mm);
+                matrix.ger(w, &row, &row, 1.0);
+                right.axpy(-w * o.residual_mm, &row, 1.0);
+                weights.push(w);
+            }
+            (matrix, right, weights)
+        };
+        let sums: Vec<_> = observations.par_chunks(BLOCK).map(add).collect();
+        let mut matrix: Matrix6<f64> = Matrix6::zeros();
         let mut right = Vector6::zeros();
-        let scaling = self.scaling();
-        for (o, w) in observations.iter().zip(&weights) {
-            let row = Vector6::from_fn(|k, _| o.row[k] * scaling[k]);
-            matrix += *w * row * row.transpose();
-            right -= *w * o.residual_mm * row;
+        let mut weights = Vec::with_capacity(observations.len());
+        for (m, r, w) in sums {
+            matrix += m;
+            right += r;
+            weights.extend(w);
         }
+        let total: f64 = weights.iter().sum();
+        for k in (0..6).filter(|k| self.options.held[*k]) {
+            matrix.row_mut(k).fill(0.0);
+            matrix.column_mut(k).fill(0.0);
+            matrix[(k, k)] = HELD * total.max(1.0);
+            right[k] = 0.0;
+        }
+        // All points together hold a weak direction no better than one point straight on would.
+        let enough = (total / CHANCE).max(1.0);
         let eigen = SymmetricEigen::new(matrix);
         let mut move_by = Vector6::zeros();
         let mut weak = Vec::new();
         for k in 0..6 {
             let vector = eigen.eigenvectors.column(k).into_owned();
-            // All points together hold this direction no better than one point straight on would.
-            if eigen.eigenvalues[k] < 1.0 {
+            if eigen.eigenvalues[k] < enough {
                 weak.push(vector);
             } else {
                 move_by += vector * (vector.dot(&right) / eigen.eigenvalues[k]);
             }
         }
-        let unscaled: [f64; 6] = std::array::from_fn(|k| move_by[k] * scaling[k]);
+        let mut eigenvalues: [f64; 6] = eigen.eigenvalues.into();
+        for value in eigenvalues.iter_mut().filter(|v| **v > 0.5 * HELD * total) {
+            *value = f64::INFINITY;
+        }
+        eigenvalues.sort_unstable_by(f64::total_cmp);
         Some(Step {
-            twist: Twist::from_array(unscaled),
+            twist: Twist::from_scaled(&move_by, self.size_mm),
             sigma: scale,
             weights,
             matrix,
+            eigenvalues,
             weak,
         })
     }
 
-    /// Rotations are counted by what they move at the rim of the part, so that all six unknowns are mm.
-    fn scaling(&self) -> [f64; 6] {
-        std::array::from_fn(|k| if k < 3 { 1.0 / self.size_mm } else { 1.0 })
-    }
-
-    fn judge(
+    /// The pose with its covariance, good as far as the fit itself tells.
+    fn described(
         &self,
         pose: RigidTransform,
         observations: &[Observation],
         step: &Step,
-        mut findings: Vec<String>,
     ) -> Aligned {
-        let covariance = self.covariance(observations, step);
-        let twists = self.twists(step);
-        let weak_directions: Vec<String> = twist::words(&twists, self.size_mm);
-        let mut status = Verdict::Ok;
-        if let Some(id) = self.moved_edge(&twists) {
-            status = Verdict::NotDecidable;
-            findings.push(format!(
-                "alignment: the data do not hold {}, which moves edge {id}; scan another face",
-                weak_directions.join(", ")
-            ));
-        }
-        let used = |o: &&(usize, &Observation)| step.weights[o.0] > 0.0 && o.1.u_mm == 0.0;
         let (mut sum, mut count) = (0.0, 0);
-        for (_, o) in observations.iter().enumerate().filter(|o| used(&o)) {
-            sum += o.residual_mm.powi(2);
-            count += 1;
-        }
-        // Half of the scan lies elsewhere: what was found is not this part, or not this place.
-        if count * 2 < self.scan.subset(FINAL_POINTS).len() && self.options.datum_faces.is_empty() {
-            status = Verdict::NotDecidable;
-            findings.push(format!(
-                "alignment: only {count} of {} points lie near the nominal, expected more than half; check part and start",
-                self.scan.subset(FINAL_POINTS).len()
-            ));
+        for (o, w) in observations.iter().zip(&step.weights) {
+            if *w > 0.0 && o.u_mm == 0.0 {
+                sum += o.residual_mm.powi(2);
+                count += 1;
+            }
         }
         Aligned {
             alignment: Alignment {
                 part_from_machine: pose,
                 rms_mm: (sum / f64::from(count.max(1) as u32)).sqrt(),
                 points: count,
-                covariance,
-                weak_directions,
-                status,
+                covariance: self.covariance(observations, step),
+                weak_directions: twist::words(&self.twists(step), self.size_mm),
+                status: Verdict::Ok,
             },
-            findings,
+            findings: Vec::new(),
+            conclusion: Conclusion::Good,
+            eigenvalues: step.eigenvalues,
         }
-    }
-
-    /// A sharp edge that a motion of one mm at the rim along a weak direction moves by more than 0.02 mm across.
-    fn moved_edge(&self, weak: &[Twist]) -> Option<String> {
-        let edges = self.surface.body.edges();
-        for (e, edge) in edges.iter().enumerate() {
-            for share in [0.1, 0.5, 0.9] {
-                let station = self.surface.body.station(e, share * edge.length_mm);
-                for normal in station.normals {
-                    let row = pose_row(station.point, normal);
-                    if weak.iter().any(|w| w.along(&row).abs() > 0.02) {
-                        return Some(edge.id.clone());
-                    }
-                }
-            }
-        }
-        None
     }
 
     /// Covariance about the part origin: noise, and what faces and patches of faces share beyond noise.
     fn covariance(&self, observations: &[Observation], step: &Step) -> [[f64; 6]; 6] {
-        let scaling = self.scaling();
         let mut held = step.matrix;
         for weak in &step.weak {
             // A weak direction is known to the size of the part, and is no part of the fit.
@@ -432,7 +658,7 @@ impl<B: Body> Task<'_, B> {
                 observations,
                 (step, &inverse),
                 |o| group(o, self.size_mm),
-                &scaling,
+                self.size_mm,
             )
         };
         // Faces shift, and patches bend and tilt them: the first moves the part, the second turns it.
@@ -442,7 +668,17 @@ impl<B: Body> Task<'_, B> {
         for weak in &step.weak {
             scaled += weak * weak.transpose() * self.size_mm.powi(2);
         }
-        std::array::from_fn(|i| std::array::from_fn(|j| scaled[(i, j)] * scaling[i] * scaling[j]))
+        let unit = |k: usize| if k < 3 { 1.0 / self.size_mm } else { 1.0 };
+        let held = self.options.held;
+        std::array::from_fn(|i| {
+            std::array::from_fn(|j| {
+                if held[i] || held[j] {
+                    0.0
+                } else {
+                    scaled[(i, j)] * unit(i) * unit(j)
+                }
+            })
+        })
     }
 
     /// Variance of one observation of full weight; Tukey's weights cost 5 % of the information.
@@ -459,73 +695,20 @@ impl<B: Body> Task<'_, B> {
     }
 }
 
-/// The patch of its face that an observation lies on, a third of the part's half-diagonal wide.
-fn patch_of(o: &Observation, size_mm: f64) -> u64 {
-    let foot = o.point - o.residual_mm * DVec3::new(o.row[3], o.row[4], o.row[5]);
-    // Shifted off the planes through the origin, on which the foot's rounding would choose the cell.
-    let cell = (3.0 * foot / size_mm + 0.377).floor().as_i64vec3();
-    let place = (cell.x.wrapping_mul(0x1F_FFF7) ^ cell.y.wrapping_mul(0x3F_FF1D)) ^ cell.z;
-    u64::from(o.face) << 40 | (place as u64 & 0xFF_FFFF_FFFF)
+/// Whether two poses differ by more than a motion that the data do not hold.
+fn is_different(a: &RigidTransform, b: &RigidTransform, weak: &[Twist], size_mm: f64) -> bool {
+    difference(a, b, weak, size_mm).size(size_mm) > 0.1 * size_mm
 }
 
-/// Variance of the median of normal noise over that of the mean: pi / 2.
-const MEDIAN_VARIANCE: f64 = std::f64::consts::FRAC_PI_2;
-
-/// What the pose may be off because faces, or patches of them, depart from the nominal by amounts that nobody knows.
-///
-/// Every group is taken to be shifted at random; the variance of the shifts is estimated from the median residuals of *all*
-/// groups, those that the robust fit turned down included: which of two opposite faces is off cannot be told from the scan.
-/// The median, because the points of an edge break or of the spot's smear at a face's rim are no shift of the face.
-/// Where no group is redundant (three datum faces) the shifts cannot be seen, and the groups define the frame.
-fn form(
-    observations: &[Observation],
-    (step, inverse): (&Step, &Matrix6<f64>),
-    group: impl Fn(&Observation) -> u64,
-    scaling: &[f64; 6],
-) -> Matrix6<f64> {
-    // By group: weighted sum of rows, sum of weights, residuals.
-    let mut groups: BTreeMap<u64, (Vector6<f64>, f64, Vec<f64>)> = BTreeMap::new();
-    for (o, w) in observations.iter().zip(&step.weights) {
-        if o.u_mm > 0.0 {
-            continue;
-        }
-        let entry = groups.entry(group(o)).or_default();
-        entry.0 += *w * Vector6::from_fn(|k, _| o.row[k] * scaling[k]);
-        entry.1 += w;
-        entry.2.push(o.residual_mm);
+/// The motion from one pose to the other, without what the data do not hold.
+fn difference(a: &RigidTransform, b: &RigidTransform, weak: &[Twist], size_mm: f64) -> Twist {
+    let mut motion = Twist::logarithm(&(*b * a.inverse()));
+    // Out of the motion goes its share along each weak direction; they are orthonormal with rotations counted at the rim.
+    for w in weak {
+        let dot = motion.turn.dot(w.turn) * size_mm * size_mm + motion.shift.dot(w.shift);
+        let norm = w.turn.length_squared() * size_mm * size_mm + w.shift.length_squared();
+        motion.turn -= dot / norm * w.turn;
+        motion.shift -= dot / norm * w.shift;
     }
-    let total = observations.len() as f64;
-    let (mut square, mut expected, mut freedom) = (0.0, 0.0, 0.0);
-    let mut scatter = Matrix6::zeros();
-    for (rows, weight, residuals) in groups.values_mut() {
-        scatter += *rows * rows.transpose();
-        let count = residuals.len() as f64;
-        // A handful of stray points is no face.
-        if count < 20.0f64.max(0.002 * total) {
-            continue;
-        }
-        let middle = median(residuals);
-        let sigma = mad_sigma(residuals);
-        let leverage = (rows.transpose() * inverse * *rows)[0] / weight.max(1e-9);
-        let left = (1.0 - leverage).clamp(0.0, 1.0);
-        square += middle * middle;
-        expected += left * MEDIAN_VARIANCE * sigma * sigma / count;
-        freedom += left;
-    }
-    let excess = square - expected;
-    if freedom < 0.5 || excess < SIGNIFICANT * expected * (2.0 / freedom).sqrt() {
-        return Matrix6::zeros();
-    }
-    inverse * scatter * inverse * (excess / freedom)
-}
-
-/// A Gauss-Newton step.
-struct Step {
-    twist: Twist,
-    sigma: f64,
-    weights: Vec<f64>,
-    /// Normal matrix in scaled unknowns.
-    matrix: Matrix6<f64>,
-    /// Unit vectors, in scaled unknowns, that the data do not hold.
-    weak: Vec<Vector6<f64>>,
+    motion
 }

@@ -1,11 +1,16 @@
 //! Which face of the nominal every point of an aligned scan belongs to, and how far from it it lies.
 
+pub(in crate::inspect) mod grid;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
 use super::body::{Body, BodySample};
 use crate::points::PointCloud;
 use crate::points::neighbors::Neighbors;
+
+pub(super) use grid::Near;
+use grid::{Grid, sample_of};
 
 /// The face of a point that belongs to none.
 pub const NO_FACE: u32 = u32::MAX;
@@ -22,7 +27,9 @@ pub struct Surface<'a, B: Body> {
     pub body: &'a B,
     samples: Vec<BodySample>,
     tree: Neighbors,
+    grid: Grid,
     spacing_mm: f64,
+    size_mm: f64,
 }
 
 /// The place of a point on the nominal.
@@ -52,11 +59,14 @@ impl<'a, B: Body> Surface<'a, B> {
         let spacing_mm = ((high - low).length() / 200.0).max(1e-9);
         let samples = body.samples(spacing_mm);
         let points: Vec<DVec3> = samples.iter().map(|s| s.point).collect();
+        let tree = Neighbors::new(&points);
         Self {
             body,
-            tree: Neighbors::new(&points),
+            grid: Grid::new(body, &samples, &tree, spacing_mm),
+            tree,
             samples,
             spacing_mm,
+            size_mm: (0.5 * (high - low).length()).max(1e-9),
         }
     }
 
@@ -65,9 +75,24 @@ impl<'a, B: Body> Surface<'a, B> {
         &self.samples
     }
 
+    /// Half the diagonal of the nominal's bounds, mm.
+    pub(super) fn size_mm(&self) -> f64 {
+        self.size_mm
+    }
+
     /// Distance of the samples, mm.
     pub fn spacing_mm(&self) -> f64 {
         self.spacing_mm
+    }
+
+    /// The sample nearest to `p` within a few spacings, seen from the nominal's box where `p` lies outside of it.
+    pub(super) fn near(&self, p: DVec3) -> Option<&Near> {
+        self.grid.near(p)
+    }
+
+    /// As [`Surface::near`], three times as rough and faster.
+    pub(super) fn rough(&self, p: DVec3) -> Option<&Near> {
+        self.grid.rough(p)
     }
 
     /// The place of `p` on the nearest face whose outside is seen from `towards` (unit vector, where it is known), if it
@@ -79,8 +104,52 @@ impl<'a, B: Body> Surface<'a, B> {
         gate_mm: f64,
         found: &mut Vec<(u32, f64)>,
     ) -> Place {
+        self.place_and_rim(p, towards, gate_mm, found).0
+    }
+
+    /// As [`Surface::place`], with the distance of `p` from the nearest edge between its face and another one that is not
+    /// tangent to it, mm, as far as faces near `p` tell: infinite in the middle of a face.
+    pub(super) fn place_and_rim(
+        &self,
+        p: DVec3,
+        towards: Option<DVec3>,
+        gate_mm: f64,
+        found: &mut Vec<(u32, f64)>,
+    ) -> (Place, f64) {
+        let mut best = Candidate::NONE;
+        let mut rim = f64::INFINITY;
+        for candidate in self.grid.candidates(p) {
+            let (index, middle) = sample_of(*candidate);
+            let limit = (best.place.distance_mm, middle);
+            let Some(new) = self.candidate(p, &self.samples[index], towards, limit) else {
+                continue;
+            };
+            let (kept, other) = if new.place.distance_mm < best.place.distance_mm {
+                (new, best)
+            } else {
+                (best, new)
+            };
+            best = kept;
+            if other.place.face != NO_FACE && other.place.face != best.place.face {
+                rim = rim.min(distance_of_edge(&best.place, &other.place));
+            }
+        }
+        if best.inside && best.place.distance_mm <= gate_mm {
+            return (best.place, rim);
+        }
+        (self.nearest_of_samples(p, towards, gate_mm, found), rim)
+    }
+
+    /// The place by the nearest samples: wherever the cells do not tell.
+    fn nearest_of_samples(
+        &self,
+        p: DVec3,
+        towards: Option<DVec3>,
+        gate_mm: f64,
+        found: &mut Vec<(u32, f64)>,
+    ) -> Place {
         self.tree.nearest(p, CANDIDATES, found);
-        let mut best = (f64::INFINITY, NOWHERE);
+        let mut best = Candidate::NONE;
         let mut faces = [NO_FACE; CANDIDATES];
         for (k, (index, squared)) in found.iter().enumerate() {
             let sample = &self.samples[*index as usize];
@@ -89,44 +158,51 @@ impl<'a, B: Body> Surface<'a, B> {
             }
             faces[k] = sample.face;
             // No place of this face is nearer than its nearest sample less the sampling.
-            if squared.sqrt() - 2.0 * self.spacing_mm > best.0.min(gate_mm) {
+            let limit = best.place.distance_mm.min(gate_mm);
+            if squared.sqrt() - 2.0 * self.spacing_mm > limit {
                 continue;
             }
-            if let Some((distance, place)) = self.candidate(p, sample, towards)
-                && distance < best.0
-                && distance <= gate_mm
+            if let Some(new) = self.candidate(p, sample, towards, (f64::INFINITY, false))
+                && new.place.distance_mm < best.place.distance_mm
+                && new.place.distance_mm <= gate_mm
             {
-                best = (distance, place);
+                best = new;
             }
         }
-        best.1
+        best.place
     }
 
-    /// The place of `p` on the face of `sample`, with the distance that ranks it: to the trimmed face.
+    /// The place of `p` on the face of `sample`, with the distance that ranks it: to the trimmed face. A face that lies
+    /// further away than `limit_mm`, or is known to have `p` in its middle, is not asked for its boundary.
     fn candidate(
         &self,
         p: DVec3,
         sample: &BodySample,
         towards: Option<DVec3>,
-    ) -> Option<(f64, Place)> {
+        (limit_mm, middle): (f64, bool),
+    ) -> Option<Candidate> {
         let foot = self.body.foot(sample.face, p, Some(sample.uv))?;
         if towards.is_some_and(|t| t.dot(foot.normal) < HORIZON) {
             return None;
         }
         let deviation_mm = (p - foot.point).dot(foot.normal);
-        let distance = if self.body.contains(sample.face, foot.uv) {
-            (p - foot.point).length()
+        let straight_mm = (p - foot.point).length();
+        let inside = straight_mm < limit_mm && (middle || self.body.contains(sample.face, foot.uv));
+        let distance_mm = if inside {
+            straight_mm
         } else {
             // Beyond the boundary: the nearest sample stands for the nearest place.
-            p.distance(sample.point).max(deviation_mm.abs())
+            p.distance(sample.point).max(straight_mm)
         };
         let place = Place {
             face: sample.face,
             deviation_mm,
             normal: foot.normal,
-            distance_mm: distance,
+            distance_mm,
         };
-        distance.is_finite().then_some((distance, place))
+        distance_mm
+            .is_finite()
+            .then_some(Candidate { place, inside })
     }
 
     /// The places of all points of `cloud`, which lies in the part frame.
@@ -139,6 +215,32 @@ impl<'a, B: Body> Surface<'a, B> {
             })
             .collect()
     }
+}
+
+/// A face that may be the nearest.
+#[derive(Debug, Clone, Copy)]
+struct Candidate {
+    place: Place,
+    /// Whether the foot lies inside the face's boundary.
+    inside: bool,
+}
+
+impl Candidate {
+    const NONE: Self = Self {
+        place: NOWHERE,
+        inside: false,
+    };
+}
+
+/// Distance of a point on one face from where its plane there meets the plane of another face; infinite where they are
+/// tangent to each other.
+fn distance_of_edge(on: &Place, other: &Place) -> f64 {
+    let sine = on.normal.cross(other.normal).length();
+    // Below 5 degrees an edge is none: see the nominal's sharp edges.
+    if sine < 0.0872 {
+        return f64::INFINITY;
+    }
+    other.deviation_mm.abs() / sine
 }
 
 /// The direction from which point `i` was seen, where it is known.

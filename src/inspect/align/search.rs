@@ -1,207 +1,331 @@
-//! A pose from nothing: pairs of oriented points, voting, and refinement of the best.
+//! A pose from nothing or from a rough start: a lattice of poses, of which the best are followed down.
 //!
-//! A pair of points with normals has four numbers that no motion changes: the distance, the angles of both normals with
-//! the line between them, and the angle between the normals. Pairs of the scan look up pairs of the nominal with the same numbers and
-//! vote for the pose that brings them together (Drost et al. 2010, "Model globally, match locally"). We differ: the
-//! nominal's samples are exact, the candidates are ranked by distances to the exact faces, and a pose is an answer only when
-//! no other fits as well.
+//! The lattice covers every turn and shift that the start leaves open, densely enough that the true pose lies in the basin of one of
+//! its members. Each is judged by a few points through the cells of [`Surface`], each of the best hundreds is followed down on the
+//! planes of the nearest samples, and the best of these on the exact faces. What fits as well as the best is kept beside it.
+//!
+//! Turns are spread evenly by super-Fibonacci spirals (Alexa, "Super-Fibonacci Spirals", CVPR 2022).
 
-use std::collections::HashMap;
-
-use glam::{DMat3, DVec3};
+use glam::{DMat3, DQuat, DVec3, Vec3};
+use nalgebra::{Matrix6, Vector6};
 use rayon::prelude::*;
 
+use super::scene::{Fit, Oriented, Scene};
 use super::twist::Twist;
-use super::{AlignOptions, Scan, Task, size};
+use super::{Start, Task, is_different};
 use crate::geometry::RigidTransform;
-use crate::geometry::fit::{fit_plane, median};
-use crate::inspect::assign::{Surface, towards};
+use crate::inspect::assign::{Near, Surface};
 use crate::inspect::body::Body;
 
-/// Samples of the nominal that take part in pairs.
-const MODEL: usize = 500;
+/// Points that judge a member of the lattice, and that it is followed down with.
+const RATED_BY: usize = 48;
+const SETTLED_BY: usize = 240;
 
-/// Points of the scan that pairs start from, and that they end at.
-const ANCHORS: usize = 60;
-const PARTNERS: usize = 500;
+/// Members that are followed down on samples, steps at most, and those of them that go on to the exact faces.
+const SETTLED: usize = 400;
+const SETTLE_STEPS: usize = 14;
+const REFINED: usize = 20;
 
-/// Cells of the distance over the nominal's diagonal, of the angles over pi, and of the turn about the anchor's normal.
-const DISTANCE_CELLS: f64 = 25.0;
-const ANGLE_CELLS: f64 = 15.0;
-const TURN_CELLS: usize = 30;
+/// Turns of the lattice over all orientations: neighbours are 20 degrees apart.
+const TURNS: usize = 1600;
 
-/// Poses that are ranked by distances, and those of them that are refined.
-const REFINED: usize = 16;
+/// Step of the lattice around a rough start, rad, and of its shifts over the half-diagonal.
+const TURN_STEP_RAD: f64 = 0.2;
+const SHIFT_STEP: f64 = 0.24;
 
-/// Points and steps of their refinement.
-const REFINEMENT: (usize, usize) = (500, 15);
+/// Members of the lattice that are judged at most.
+const MOST: usize = 400_000;
 
-/// A pose whose residuals are below this many times those of the best fits as well: the part's own deviations may hide
-/// the difference.
-const AS_WELL: f64 = 1.6;
+/// Distances count up to this share of the half-diagonal.
+const CAP: f64 = 0.3;
 
-/// A pose that fits, and whether others fit as well.
-pub(super) struct Found {
+/// Points and steps on the exact faces.
+const REFINEMENT: (usize, usize) = (600, 12);
+
+/// A pose that the search ended at.
+pub(super) struct Pose {
     pub(super) pose: RigidTransform,
-    pub(super) ambiguous: bool,
-    pub(super) findings: Vec<String>,
+    pub(super) fit: Fit,
+    /// What the data do not hold.
+    pub(super) weak: Vec<Twist>,
 }
 
-/// A point with its outward normal.
-#[derive(Debug, Clone, Copy)]
-struct Oriented {
-    point: DVec3,
-    normal: DVec3,
-}
-
-/// The best pose; `None` where no pose brings half of the scan near the nominal.
-pub(super) fn search<B: Body>(scan: &Scan<'_>, surface: &Surface<'_, B>) -> Option<Found> {
-    let model = model_points(surface);
-    let scene = scene_points(scan);
-    if model.len() < 3 || scene.len() < 3 {
-        return None;
+/// Best first: the poses that the scene settles at, each different from the others.
+///
+/// With a rough start its own minimum comes first unless another is better: where several fit, the start decides.
+pub(super) fn search<B: Body>(task: &Task<'_, B>, scene: &Scene, start: Start) -> Vec<Pose> {
+    if scene.points.len() < 12 {
+        return Vec::new();
     }
-    let mut candidates = vote(&model, &scene, 2.0 * size(surface.body));
-    let few = scan.subset(300);
-    let score = |pose: &RigidTransform| score(pose, scan, surface, &few);
-    candidates.sort_by(|a, b| a.1.total_cmp(&b.1).reverse());
-    candidates.truncate(400);
-    let mut ranked: Vec<(f64, RigidTransform)> = candidates
-        .par_iter()
-        .map(|(pose, _)| (score(pose), *pose))
-        .collect();
-    ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
-    let starts = distinct(&ranked, 0.15 * size(surface.body), surface);
-    let task = Task {
-        scan,
-        surface,
-        options: &AlignOptions::default(),
-        size_mm: size(surface.body),
+    let region = match start {
+        Start::Auto => Region::everywhere(task),
+        Start::Rough(pose) => Region::around(task, scene, pose),
+        Start::None => return Vec::new(),
     };
-    let mut refined: Vec<(f64, RigidTransform, Vec<Twist>)> = starts
-        .into_par_iter()
-        .filter_map(|start| {
-            let (pose, weak) = task.coarse(start, REFINEMENT)?;
-            Some((score(&pose), pose, weak))
-        })
+    let few = scene.few(RATED_BY);
+    let mut rated: Vec<(f64, RigidTransform)> = region
+        .turns
+        .par_iter()
+        .flat_map_iter(|turn| region.best_shifts(task.surface, *turn, &few, scene.centre))
         .collect();
-    refined.sort_by(|a, b| a.0.total_cmp(&b.0));
-    judge(refined, scan, surface)
-}
-
-/// The best of the refined poses, and whether a different one fits as well.
-fn judge<B: Body>(
-    refined: Vec<(f64, RigidTransform, Vec<Twist>)>,
-    scan: &Scan<'_>,
-    surface: &Surface<'_, B>,
-) -> Option<Found> {
-    let size_mm = size(surface.body);
-    let (best, pose, weak) = refined.first()?;
-    if *best > 0.1 * size_mm {
-        return None;
-    }
-    let floor = scan.noise_mm.max(1e-6 * size_mm);
-    let others: Vec<&RigidTransform> = refined[1..]
-        .iter()
-        .filter(|(s, other, _)| {
-            *s < AS_WELL * best.max(floor) && is_different(pose, other, weak, size_mm)
-        })
-        .map(|(_, other, _)| other)
-        .collect();
-    let mut distinct: Vec<&RigidTransform> = Vec::new();
-    for other in others {
-        if distinct
-            .iter()
-            .all(|d| is_different(d, other, weak, size_mm))
-        {
-            distinct.push(other);
-        }
-    }
-    let mut findings = Vec::new();
-    if !distinct.is_empty() {
-        findings.push(format!(
-            "alignment: {} poses fit the scan equally well, expected one; the part is symmetric or too little of it was scanned: \
-             give a rough start",
-            distinct.len() + 1
-        ));
-    }
-    Some(Found {
-        pose: *pose,
-        ambiguous: !distinct.is_empty(),
-        findings,
-    })
-}
-
-/// Whether two poses differ by more than a motion that the data do not hold.
-fn is_different(a: &RigidTransform, b: &RigidTransform, weak: &[Twist], size_mm: f64) -> bool {
-    let mut motion = Twist::logarithm(&(*b * a.inverse()));
-    // Out of the motion goes its share along each weak direction; they are orthonormal with rotations counted at the rim.
-    for w in weak {
-        let dot = motion.turn.dot(w.turn) * size_mm * size_mm + motion.shift.dot(w.shift);
-        let norm = w.turn.length_squared() * size_mm * size_mm + w.shift.length_squared();
-        motion.turn -= dot / norm * w.turn;
-        motion.shift -= dot / norm * w.shift;
-    }
-    motion.size(size_mm) > 0.1 * size_mm
-}
-
-/// Median distance of the points `few` to the nominal, mm: an outer quarter may be fixtures and reflections.
-fn score<B: Body>(
-    pose: &RigidTransform,
-    scan: &Scan<'_>,
-    surface: &Surface<'_, B>,
-    few: &[u32],
-) -> f64 {
-    let size_mm = size(surface.body);
-    let mut found = Vec::new();
-    let mut distances: Vec<f64> = few
-        .iter()
-        .map(|i| {
-            let i = *i as usize;
-            let p = pose.point(scan.cloud.positions[i]);
-            let view = towards(scan.cloud, i).map(|v| pose.vector(v));
-            let place = surface.place(p, view, size_mm, &mut found);
-            if place.face == crate::inspect::assign::NO_FACE {
-                size_mm
-            } else {
-                place.distance_mm
-            }
-        })
-        .collect();
-    let n = distances.len();
-    if n == 0 {
-        return f64::INFINITY;
-    }
-    distances.sort_by(f64::total_cmp);
-    // Root mean square of the nearer three quarters, and their limit, so that one wrong face counts.
-    let kept = &distances[..(3 * n).div_ceil(4)];
-    (kept.iter().map(|d| d * d).sum::<f64>() / kept.len() as f64).sqrt()
-        + 0.1 * median(&mut distances.clone())
-}
-
-/// The first poses of `ranked` that differ from each other by more than `apart` mm, at most [`REFINED`].
-fn distinct<B: Body>(
-    ranked: &[(f64, RigidTransform)],
-    apart: f64,
-    surface: &Surface<'_, B>,
-) -> Vec<RigidTransform> {
-    let [low, high] = surface.body.bounds();
-    let corners: Vec<DVec3> = (0..8)
-        .map(|k| {
-            DVec3::new(
-                if k & 1 == 0 { low.x } else { high.x },
-                if k & 2 == 0 { low.y } else { high.y },
-                if k & 4 == 0 { low.z } else { high.z },
+    rated.sort_by(|a, b| a.0.total_cmp(&b.0));
+    rated.truncate(SETTLED);
+    let settled_by = scene.few(SETTLED_BY);
+    let mut settled: Vec<(f64, RigidTransform)> = rated
+        .par_iter()
+        .map(|(_, pose)| {
+            let pose = settle(*pose, &settled_by, task.surface, task.size_mm);
+            (
+                rate(&pose, &settled_by, task.surface, 0.1 * task.size_mm),
+                pose,
             )
         })
         .collect();
+    settled.sort_by(|a, b| a.0.total_cmp(&b.0));
+    let distinct = distinct(&settled, 0.08 * task.size_mm, task);
+    refine(task, scene, distinct)
+}
+
+/// Those of `starts` that settle at a place which a few points rate hardly worse than `pose` of another scene, settled.
+pub(super) fn promising<B: Body>(
+    task: &Task<'_, B>,
+    (scene, starts): (&Scene, Vec<RigidTransform>),
+    (other, pose): (&Scene, &RigidTransform),
+) -> Vec<RigidTransform> {
+    let scale = 0.1 * task.size_mm;
+    let own = rate(pose, &other.few(SETTLED_BY), task.surface, scale);
+    let few = scene.few(SETTLED_BY);
+    starts
+        .into_iter()
+        .map(|start| settle(start, &few, task.surface, task.size_mm))
+        .filter(|settled| rate(settled, &few, task.surface, scale) < own + 0.05)
+        .collect()
+}
+
+/// Follows every start down on the exact faces; best first.
+pub(super) fn refine<B: Body>(
+    task: &Task<'_, B>,
+    scene: &Scene,
+    starts: Vec<RigidTransform>,
+) -> Vec<Pose> {
+    let cap_mm = task.cap_mm();
+    let mut refined: Vec<Pose> = starts
+        .into_par_iter()
+        .map(|start| {
+            let (pose, weak) = task.on_scene(scene, start, REFINEMENT);
+            Pose {
+                pose,
+                fit: scene.fit(&pose, task.surface, cap_mm),
+                weak,
+            }
+        })
+        .collect();
+    refined.sort_by(|a, b| a.fit.rms_mm.total_cmp(&b.fit.rms_mm));
+    let mut kept: Vec<Pose> = Vec::new();
+    for pose in refined {
+        let new = |k: &Pose| is_different(&k.pose, &pose.pose, &k.weak, task.size_mm);
+        if kept.iter().all(new) {
+            kept.push(pose);
+        }
+    }
+    kept
+}
+
+/// Turns, and places of the scene's centre in the part frame, that a start leaves open.
+struct Region {
+    turns: Vec<DQuat>,
+    places: Vec<DVec3>,
+}
+
+impl Region {
+    fn everywhere<B: Body>(task: &Task<'_, B>) -> Self {
+        let [low, high] = task.surface.body.bounds();
+        // The middle of the points lies in the part's box.
+        let step = SHIFT_STEP * task.size_mm;
+        let inside = |p: &DVec3| p.cmpge(low).all() && p.cmple(high).all();
+        let places: Vec<DVec3> = lattice(0.5 * (low + high), task.size_mm, step)
+            .into_iter()
+            .filter(inside)
+            .collect();
+        let turns = TURNS.min(MOST / places.len().max(1));
+        Self {
+            turns: (0..turns).map(|k| spiral(k, turns)).collect(),
+            places,
+        }
+    }
+
+    fn around<B: Body>(task: &Task<'_, B>, scene: &Scene, start: RigidTransform) -> Self {
+        let prior = task.options.start_within;
+        let [low, high] = task.surface.body.bounds();
+        let place = start.point(scene.centre);
+        // A turn about the part's middle moves the middle of a partial scan.
+        let lever = place.distance(0.5 * (low + high)).min(task.size_mm);
+        let reach = prior.shift_share * task.size_mm + prior.turn_rad * lever;
+        let turns = lattice(
+            DVec3::ZERO,
+            prior.turn_rad + 0.5 * TURN_STEP_RAD,
+            TURN_STEP_RAD,
+        )
+        .into_iter()
+        .map(|v| DQuat::from_scaled_axis(v) * start.rotation)
+        .collect();
+        Self {
+            turns,
+            places: lattice(place, reach, SHIFT_STEP * task.size_mm),
+        }
+    }
+
+    /// The best two shifts for a turn, with their ratings.
+    fn best_shifts<B: Body>(
+        &self,
+        surface: &Surface<'_, B>,
+        turn: DQuat,
+        few: &[Oriented],
+        centre: DVec3,
+    ) -> Vec<(f64, RigidTransform)> {
+        let matrix = DMat3::from_quat(turn);
+        let turned: Vec<(DVec3, Vec3, bool)> = few
+            .iter()
+            .map(|o| {
+                let normal = (matrix * o.normal).as_vec3();
+                (matrix * (o.point - centre), normal, o.towards.is_some())
+            })
+            .collect();
+        let scale = surface.size_mm() * CAP;
+        let mut best = [(f64::INFINITY, DVec3::ZERO); 2];
+        for place in &self.places {
+            let mut sum = 0.0;
+            for (p, normal, signed) in &turned {
+                let p = *p + *place;
+                sum += miss(surface.rough(p), p, *normal, *signed, scale);
+                if sum > best[1].0 {
+                    break;
+                }
+            }
+            if sum < best[0].0 {
+                best = [(sum, *place), best[0]];
+            } else if sum < best[1].0 {
+                best[1] = (sum, *place);
+            }
+        }
+        best.into_iter()
+            .filter(|b| b.0.is_finite())
+            .map(|(sum, place)| (sum, RigidTransform::new(turn, place - matrix * centre)))
+            .collect()
+    }
+}
+
+/// Distance of a point from the sample of its cell over `scale`, 0 to 1; 1 where the normals disagree.
+#[inline]
+fn miss(near: Option<&Near>, p: DVec3, normal: Vec3, signed: bool, scale: f64) -> f64 {
+    let Some(near) = near else {
+        return 1.0;
+    };
+    let cosine = near.normal.dot(normal);
+    if (if signed { cosine } else { cosine.abs() }) < 0.6 {
+        return 1.0;
+    }
+    let offset = p.as_vec3() - near.point;
+    (f64::from(offset.length()) / scale).min(1.0)
+}
+
+/// Mean miss of `points` under a pose.
+fn rate<B: Body>(
+    pose: &RigidTransform,
+    points: &[Oriented],
+    surface: &Surface<'_, B>,
+    scale: f64,
+) -> f64 {
+    let matrix = DMat3::from_quat(pose.rotation);
+    let sum: f64 = points
+        .iter()
+        .map(|o| {
+            let p = matrix * o.point + pose.translation;
+            let normal = (matrix * o.normal).as_vec3();
+            miss(surface.near(p), p, normal, o.towards.is_some(), scale)
+        })
+        .sum();
+    sum / points.len().max(1) as f64
+}
+
+/// Follows a pose down on the planes of the nearest samples.
+fn settle<B: Body>(
+    start: RigidTransform,
+    points: &[Oriented],
+    surface: &Surface<'_, B>,
+    size_mm: f64,
+) -> RigidTransform {
+    let mut pose = start;
+    let mut gate = 0.6 * size_mm;
+    for _ in 0..SETTLE_STEPS {
+        let matrix = DMat3::from_quat(pose.rotation);
+        let mut normal_matrix = Matrix6::<f64>::zeros();
+        let mut right = Vector6::<f64>::zeros();
+        let mut count = 0.0;
+        for o in points {
+            let p = matrix * o.point + pose.translation;
+            let Some(near) = surface.near(p) else {
+                continue;
+            };
+            let cosine = f64::from(near.normal.dot((matrix * o.normal).as_vec3()));
+            let cosine = if o.towards.is_some() {
+                cosine
+            } else {
+                cosine.abs()
+            };
+            let offset = p - near.point.as_dvec3();
+            let ratio = offset.length() / gate;
+            if cosine < 0.3 || ratio > 1.0 {
+                continue;
+            }
+            let n = near.normal.as_dvec3();
+            let residual = offset.dot(n);
+            let lever = p.cross(n) / size_mm;
+            let row = Vector6::new(lever.x, lever.y, lever.z, n.x, n.y, n.z);
+            let weight = cosine * (1.0 - ratio * ratio).powi(2);
+            normal_matrix.ger(weight, &row, &row, 1.0);
+            right.axpy(-weight * residual, &row, 1.0);
+            count += weight;
+        }
+        // Damped, so that what the points do not hold stays where it is.
+        for k in 0..6 {
+            normal_matrix[(k, k)] += 1e-3 * count + 1e-9;
+        }
+        let Some(factor) = normal_matrix.cholesky() else {
+            return pose;
+        };
+        let step = factor.solve(&right);
+        let twist = Twist::from_array(std::array::from_fn(|k| {
+            if k < 3 { step[k] / size_mm } else { step[k] }
+        }));
+        pose = twist.transform() * pose;
+        gate = (0.75 * gate).max(0.05 * size_mm);
+        if twist.size(size_mm) < 1e-3 * size_mm && gate <= 0.06 * size_mm {
+            break;
+        }
+    }
+    pose
+}
+
+/// The first poses that differ from each other by more than `apart_mm` at a corner of the part, at most [`REFINED`].
+fn distinct<B: Body>(
+    ranked: &[(f64, RigidTransform)],
+    apart_mm: f64,
+    task: &Task<'_, B>,
+) -> Vec<RigidTransform> {
+    let [low, high] = task.surface.body.bounds();
+    let corner = |k: u32| {
+        DVec3::new(
+            if k & 1 == 0 { low.x } else { high.x },
+            if k & 2 == 0 { low.y } else { high.y },
+            if k & 4 == 0 { low.z } else { high.z },
+        )
+    };
     let mut kept: Vec<RigidTransform> = Vec::new();
     for (_, pose) in ranked {
         let far = |other: &RigidTransform| {
-            corners.iter().any(|c| {
-                let p = other.inverse().point(*c);
-                pose.point(p).distance(*c) > apart
-            })
+            let motion = *pose * other.inverse();
+            (0..8).any(|k| motion.point(corner(k)).distance(corner(k)) > apart_mm)
         };
         if kept.iter().all(far) {
             kept.push(*pose);
@@ -213,154 +337,60 @@ fn distinct<B: Body>(
     kept
 }
 
-fn model_points<B: Body>(surface: &Surface<'_, B>) -> Vec<Oriented> {
-    let samples = surface.samples();
-    let points: Vec<DVec3> = samples.iter().map(|s| s.point).collect();
-    // In the order of a space-filling curve every k-th sample spreads evenly.
-    let order = crate::points::Neighbors::new(&points);
-    let step = order.order().len().div_ceil(MODEL).max(1);
-    order
-        .order()
-        .iter()
-        .step_by(step)
-        .map(|i| Oriented {
-            point: samples[*i as usize].point,
-            normal: samples[*i as usize].normal,
-        })
-        .collect()
-}
-
-/// Points of the scan with normals from planes through their neighbourhoods, towards the sensor, or away from the middle of the scan
-/// where no sensor is known.
-fn scene_points(scan: &Scan<'_>) -> Vec<Oriented> {
-    let cloud = scan.cloud;
-    let indices = scan.subset(PARTNERS);
-    let Some((low, high)) = cloud.bounds() else {
-        return Vec::new();
-    };
-    let middle = 0.5 * (low + high);
-    let radius = 3.0 * scan.spacing.across_mm.max(scan.spacing.along_mm);
-    indices
-        .par_iter()
-        .map_init(
-            || (Vec::new(), Vec::new()),
-            |(found, near), i| {
-                let i = *i as usize;
-                let p = cloud.positions[i];
-                scan.neighbors.within(p, radius, found);
-                near.clear();
-                near.extend(
-                    found
-                        .iter()
-                        .take(200)
-                        .map(|(j, _)| cloud.positions[*j as usize]),
-                );
-                let plane = fit_plane(near)?;
-                // On an edge there is no normal.
-                if plane.rms > 3.0 * scan.noise_mm + 0.02 * radius {
-                    return None;
+/// Places of a cubic lattice within `radius` of `centre`, which is one of them.
+fn lattice(centre: DVec3, radius: f64, step: f64) -> Vec<DVec3> {
+    let count = (radius / step).clamp(0.0, 20.0).floor() as i32;
+    let mut places = Vec::new();
+    for x in -count..=count {
+        for y in -count..=count {
+            for z in -count..=count {
+                let offset = step * DVec3::new(f64::from(x), f64::from(y), f64::from(z));
+                if offset.length() <= radius {
+                    places.push(centre + offset);
                 }
-                let outward = towards(cloud, i).unwrap_or(p - middle);
-                let normal = if plane.normal.dot(outward) < 0.0 {
-                    -plane.normal
-                } else {
-                    plane.normal
-                };
-                Some(Oriented { point: p, normal })
-            },
-        )
-        .flatten()
-        .collect()
-}
-
-/// The numbers of a pair that no motion changes, in cells.
-fn key(a: &Oriented, b: &Oriented, diagonal: f64) -> Option<[u8; 4]> {
-    let d = b.point - a.point;
-    let length = d.length();
-    if length < 0.05 * diagonal {
-        return None;
-    }
-    let angle = |x: f64| (x.clamp(-1.0, 1.0).acos() / std::f64::consts::PI * ANGLE_CELLS) as u8;
-    let unit = d / length;
-    Some([
-        (length / diagonal * DISTANCE_CELLS).min(250.0) as u8,
-        angle(a.normal.dot(unit)),
-        angle(b.normal.dot(unit)),
-        angle(a.normal.dot(b.normal)),
-    ])
-}
-
-/// The frame of an anchor: x along its normal.
-fn frame(a: &Oriented) -> DMat3 {
-    let (y, z) = a.normal.any_orthonormal_pair();
-    DMat3::from_cols(a.normal, y, z)
-}
-
-/// The turn of `b` about the normal of `a`, in the frame of `a`.
-fn turn(a: &Oriented, axes: &DMat3, b: &Oriented) -> f64 {
-    let d = axes.transpose() * (b.point - a.point);
-    d.z.atan2(d.y)
-}
-
-/// The best poses for every anchor, with their votes.
-fn vote(model: &[Oriented], scene: &[Oriented], diagonal: f64) -> Vec<(RigidTransform, f64)> {
-    let model_axes: Vec<DMat3> = model.iter().map(frame).collect();
-    let mut table: HashMap<[u8; 4], Vec<(u32, f32)>> = HashMap::new();
-    for (i, a) in model.iter().enumerate() {
-        for (j, b) in model.iter().enumerate() {
-            if i != j
-                && let Some(key) = key(a, b, diagonal)
-            {
-                let angle = turn(a, &model_axes[i], b) as f32;
-                table.entry(key).or_default().push((i as u32, angle));
             }
         }
     }
-    let step = scene.len().div_ceil(ANCHORS).max(1);
-    let anchors: Vec<&Oriented> = scene.iter().step_by(step).collect();
-    anchors
-        .par_iter()
-        .flat_map_iter(|anchor| {
-            let model_axes = &model_axes;
-            let axes = frame(anchor);
-            let mut votes = vec![0.0f64; model.len() * TURN_CELLS];
-            for partner in scene {
-                let Some(key) = key(anchor, partner, diagonal) else {
-                    continue;
-                };
-                let Some(pairs) = table.get(&key) else {
-                    continue;
-                };
-                let own = turn(anchor, &axes, partner);
-                // A pair that many pairs of the nominal look like says little.
-                let weight = 1.0 / (pairs.len() as f64).sqrt();
-                for (i, angle) in pairs {
-                    let between = (f64::from(*angle) - own).rem_euclid(std::f64::consts::TAU);
-                    let cell = (between / std::f64::consts::TAU * TURN_CELLS as f64) as usize;
-                    votes[*i as usize * TURN_CELLS + cell.min(TURN_CELLS - 1)] += weight;
-                }
-            }
-            best_cells(&votes).into_iter().map(move |(cell, count)| {
-                let (i, t) = (cell / TURN_CELLS, cell % TURN_CELLS);
-                let angle = (t as f64 + 0.5) / TURN_CELLS as f64 * std::f64::consts::TAU;
-                let about = DMat3::from_rotation_x(angle);
-                let rotation = model_axes[i] * about * axes.transpose();
-                let shift = model[i].point - rotation * anchor.point;
-                (RigidTransform::from_matrix(rotation, shift), count)
-            })
-        })
-        .collect()
+    places
 }
 
-/// The eight cells with the most votes.
-fn best_cells(votes: &[f64]) -> Vec<(usize, f64)> {
-    let mut cells: Vec<usize> = (0..votes.len()).collect();
-    let count = 8.min(cells.len());
-    let order = |a: &usize, b: &usize| votes[*b].total_cmp(&votes[*a]).then(a.cmp(b));
-    if cells.len() > count {
-        cells.select_nth_unstable_by(count - 1, order);
-        cells.truncate(count);
+/// Turn `k` of `count` spread evenly over all orientations.
+fn spiral(k: usize, count: usize) -> DQuat {
+    let phi = std::f64::consts::SQRT_2;
+    // The positive root of x^4 = x + 4.
+    let psi = 1.533_751_168_755_204_3;
+    let s = k as f64 + 0.5;
+    let t = s / count as f64;
+    let (r, rest) = (t.sqrt(), (1.0 - t).sqrt());
+    let (alpha, beta) = (
+        std::f64::consts::TAU * s / phi,
+        std::f64::consts::TAU * s / psi,
+    );
+    DQuat::from_xyzw(
+        r * alpha.sin(),
+        r * alpha.cos(),
+        rest * beta.sin(),
+        rest * beta.cos(),
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_orientation_is_near_a_turn_of_the_lattice() {
+        let turns: Vec<DQuat> = (0..TURNS).map(|k| spiral(k, TURNS)).collect();
+        // Orientations off any regular pattern.
+        for k in 0..400 {
+            let wanted = spiral(k, 397) * DQuat::from_axis_angle(DVec3::X, 0.37);
+            let nearest = turns
+                .iter()
+                .map(|t| t.angle_between(wanted))
+                .fold(f64::INFINITY, f64::min);
+            // The published covering radius of the spirals shrinks with the cube root of their number; the basin of a
+            // pose is some 30 degrees wide.
+            assert!(nearest < 0.45, "{nearest}");
+        }
     }
-    cells.sort_by(order);
-    cells.into_iter().map(|c| (c, votes[c])).collect()
 }

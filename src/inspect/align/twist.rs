@@ -26,6 +26,18 @@ impl Twist {
         [a[0], a[1], a[2], b[0], b[1], b[2]]
     }
 
+    /// From unknowns that count turns by what they move at `size_mm`.
+    pub(super) fn from_scaled(v: &nalgebra::Vector6<f64>, size_mm: f64) -> Self {
+        Self::from_array(std::array::from_fn(|k| {
+            if k < 3 { v[k] / size_mm } else { v[k] }
+        }))
+    }
+
+    pub(super) fn scaled(&self, size_mm: f64) -> [f64; 6] {
+        let v = self.to_array();
+        std::array::from_fn(|k| if k < 3 { v[k] * size_mm } else { v[k] })
+    }
+
     /// The motion that turns by `turn` and shifts by `shift`.
     pub fn transform(&self) -> RigidTransform {
         RigidTransform::new(DQuat::from_scaled_axis(self.turn), self.shift)
@@ -91,7 +103,7 @@ pub(super) fn words(twists: &[Twist], size_mm: f64) -> Vec<String> {
 }
 
 /// `x`, `y`, `z` within two degrees of an axis, otherwise the direction.
-fn axis_name(direction: DVec3) -> String {
+pub(super) fn axis_name(direction: DVec3) -> String {
     let unit = direction.normalize_or_zero();
     for (axis, name) in [(DVec3::X, "x"), (DVec3::Y, "y"), (DVec3::Z, "z")] {
         if unit.dot(axis).abs() > 0.9994 {
