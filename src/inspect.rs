@@ -9,8 +9,11 @@ pub mod body;
 mod clusters;
 mod collect;
 pub mod compare;
+mod contributions;
+mod edge_break;
 pub mod flank;
 pub mod measure;
+pub mod monte_carlo;
 pub mod recipe;
 pub mod result;
 pub mod verdict;
@@ -99,6 +102,9 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         pose_covariance: alignment.covariance,
         u_calibration_mm: request.recipe.u_calibration_mm,
         u_calibration_rad: request.recipe.u_calibration_rad,
+        flank_mm: None,
+        depth_mm: None,
+        expansion: None,
     };
     let measured = measure_edges(&part, &places, &surface, &settings);
     stages.begin("comparison of edges found");

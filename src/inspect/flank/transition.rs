@@ -76,7 +76,7 @@ fn walk<const P: usize>(
         };
         let fits: Vec<(usize, WindowFit<P>)> = stations
             .clone()
-            .filter_map(|k| Some((k, fit_window(points, &range(k), settings.min_points).ok()?)))
+            .filter_map(|k| Some((k, fit_window(points, &range(k), settings).ok()?)))
             .collect();
         seen |= !fits.is_empty();
         let noise = variance::pooled(fits.iter().map(|f| &f.1));
