@@ -28,6 +28,7 @@ use acies::points::{Frame, Neighbors, PointCloud};
 use freeform::FreeForm;
 use glam::{DVec2, DVec3};
 use part::{Break, Layout, Made, empty_cloud};
+use rayon::prelude::*;
 use solids::{Noise, Solid};
 
 const SIGMA: f64 = 0.010;
@@ -384,6 +385,7 @@ fn defects(seeds: u64) {
         for radius in [0.2, 0.05] {
             let mut found = Recovered::default();
             let mut below: f64 = 0.0;
+            let mut kinds = [0; 3];
             broken(
                 solid,
                 edge,
@@ -395,13 +397,27 @@ fn defects(seeds: u64) {
                         BreakShape::Round { radius_mm } => Some((radius_mm, radius)),
                         BreakShape::Sharp { radius_below_mm } => {
                             below = below.max(radius_below_mm);
+                            kinds[0] += 1;
                             None
                         }
-                        _ => None,
+                        BreakShape::Chamfer { .. } => {
+                            kinds[1] += 1;
+                            None
+                        }
+                        BreakShape::Irregular => {
+                            kinds[2] += 1;
+                            None
+                        }
                     });
                 },
             );
-            found.row(&format!("radius, {name}, mm (bound {below:.3})"), radius);
+            found.row(&format!("radius, {name}, mm"), radius);
+            if found.other > 0 {
+                let [sharp, chamfer, irregular] = kinds;
+                println!(
+                    "    other: {sharp} sharp (below {below:.3} mm at most), {chamfer} chamfers, {irregular} irregular"
+                );
+            }
         }
     }
     let mut sharp = Recovered::default();
@@ -696,6 +712,20 @@ fn speed() {
         ..settings(spacing, spacing)
     };
     for _ in 0..3 {
+        let clock = Instant::now();
+        let neighbors = Neighbors::new(&cloud.positions);
+        let far: f64 = (0..cloud.positions.len())
+            .into_par_iter()
+            .map_init(Vec::new, |found, i| {
+                neighbors.nearest(cloud.positions[i], 20, found);
+                found.last().map_or(0.0, |f| f.1)
+            })
+            .sum();
+        let search = clock.elapsed().as_secs_f64();
+        println!(
+            "20 neighbours of every point: {search:.2} s (mean square of the farthest {:.4} mm2)",
+            far / 1e6
+        );
         let clock = Instant::now();
         let edges = measure_edges(&cloud, &places, &surface, &settings);
         let stations: usize = edges.iter().map(|e| e.stations.len()).sum();

@@ -252,14 +252,33 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
             let u = (1.0 / cos - 1.0) * radius_below / ONE_SIDED;
             (Quantified { value: 0.0, u }, [0.0, 0.0])
         }
-        Fitted::Chamfer { .. } => {
-            let i = usize::from(legs[1].value < legs[0].value);
-            let side = if i == 0 { 1.0 } else { -1.0 };
-            let depth = Quantified {
-                value: legs[i].value * sin,
-                u: legs[i].u * sin,
-            };
-            (depth, [side * legs[i].value * cos, -depth.value])
+        Fitted::Chamfer {
+            legs: [a, b],
+            covariance,
+        } => {
+            let tell = (covariance[0][0] + covariance[1][1] - 2.0 * covariance[0][1])
+                .max(0.0)
+                .sqrt();
+            if (a - b).abs() > 2.0 * tell {
+                let i = usize::from(b < a);
+                let side = if i == 0 { 1.0 } else { -1.0 };
+                let depth = Quantified {
+                    value: legs[i].value * sin,
+                    u: legs[i].u * sin,
+                };
+                (depth, [side * legs[i].value * cos, -depth.value])
+            } else {
+                // As high everywhere: where it crosses the bisector, which no choice between its ends biases.
+                let by = [b, a].map(|x| 2.0 * sin * (x / (a + b)).powi(2));
+                let variance = by[0] * by[0] * covariance[0][0]
+                    + 2.0 * by[0] * by[1] * covariance[0][1]
+                    + by[1] * by[1] * covariance[1][1];
+                let depth = Quantified {
+                    value: 2.0 * sin * a * b / (a + b),
+                    u: variance.max(0.0).sqrt(),
+                };
+                (depth, [0.0, -depth.value])
+            }
         }
     };
     Form {

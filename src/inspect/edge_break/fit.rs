@@ -70,7 +70,7 @@ fn shape_of<const P: usize>(p: &[f64; P]) -> Shape {
 }
 
 /// The shape that the data choose, by the Bayesian information criterion with the flanks' noise (Schwarz 1978); a
-/// radius that a score test does not tell from none is none, with its upper bound.
+/// radius below twice its uncertainty is none, with the upper bound of a score test.
 pub(super) fn choose(zone: &Zone<'_>) -> Fitted {
     let penalty = (zone.points.len() as f64).ln();
     let sharp = zone.misfit(&Shape::Sharp, 1);
@@ -93,7 +93,7 @@ pub(super) fn choose(zone: &Zone<'_>) -> Fitted {
     }
     if let Some(([radius], covariance)) = round
         && of_round < sharp
-        && zone.score(0.25 * radius) < -ONE_SIDED
+        && radius > 2.0 * covariance[0][0].sqrt()
     {
         return Fitted::Round {
             radius: Quantified {

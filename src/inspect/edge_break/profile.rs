@@ -5,12 +5,15 @@ use super::{Form, Quantified, Zone};
 use crate::geometry::fit::{mad_sigma, median};
 
 /// Bins on each flank, at most.
-const BINS: f64 = 14.0;
+const BINS: f64 = 28.0;
+
+/// Points that a bin should hold: its mean then is known to a quarter of the noise.
+const COUNT: f64 = 15.0;
 
 /// Fewest points of a bin that counts.
 const COUNT_MIN: f64 = 5.0;
 
-/// Standard uncertainties at which a bin lies off a flank: 28 bins are asked, so that a false alarm is rare.
+/// Standard uncertainties at which a bin lies off a flank: 56 bins are asked, so that a false alarm is rare.
 const LEFT: f64 = 4.0;
 
 /// A shape is refused where a bin lies off it by this much of the noise of one point: less is form, and no burr or notch.
@@ -45,7 +48,9 @@ fn place(d: [f64; 2], turn: f64) -> (usize, f64) {
 impl Profile {
     pub(super) fn new(zone: &Zone<'_>) -> Self {
         let reach = zone.reach[0].max(zone.reach[1]);
-        let width = (reach / BINS).max(zone.stretch.spacing_mm);
+        // The stations of a stretch put points at all distances, so that bins may be finer than the spacing.
+        let density = zone.points.len() as f64 / (zone.reach[0] + zone.reach[1]);
+        let width = (reach / BINS).max(COUNT / density);
         let mut profile = Self {
             width,
             sides: [Vec::new(), Vec::new()],
@@ -120,9 +125,11 @@ impl Profile {
             weight += bins[k].u.powi(-2);
             sum += bins[k].height * bins[k].u.powi(-2);
         }
+        // How far the plateau lies below its own best bin shows what bins half on a wall take away, and luck adds.
+        let mean = sum / weight;
         Quantified {
-            value: sign * sum / weight,
-            u: weight.sqrt().recip(),
+            value: sign * mean,
+            u: weight.sqrt().recip().hypot(0.5 * (top.height - mean)),
         }
     }
 
@@ -142,9 +149,10 @@ impl Profile {
             bin.counts() && off > LEFT * bin.u
         };
         let k = self.sides[side].iter().rposition(left)?;
+        // The profile may leave in this bin or in the next, where too few points of the next show it.
         Some(Quantified {
             value: (k as f64 + 0.5) * self.width,
-            u: self.width / 12f64.sqrt(),
+            u: self.width / 3f64.sqrt(),
         })
     }
 
