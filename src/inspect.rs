@@ -10,11 +10,14 @@ pub mod characteristic;
 mod clusters;
 mod collect;
 pub mod compare;
+mod contributions;
 pub mod corner;
+mod edge_break;
 pub mod flank;
 pub mod form;
 pub mod gap;
 pub mod measure;
+pub mod monte_carlo;
 pub mod quantity;
 pub mod recipe;
 pub mod result;
@@ -35,7 +38,7 @@ use assign::Surface;
 use body::BodyEdge;
 use characteristic::{EdgeValues, at_station, characteristics};
 use corner::CornerSettings;
-use measure::{MeasureSettings, MeasuredEdge, measure_edges};
+use measure::{MeasureSettings, MeasuredEdge, measure_edges_stepped};
 use quantity::Quantity;
 use recipe::{EdgeFacts, EdgeKey, Resolved};
 use result::{EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
@@ -93,6 +96,7 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let options = AlignOptions {
         datum_faces: &datums,
         touches: request.touches,
+        held: request.recipe.held,
         ..AlignOptions::default()
     };
     let Aligned {
@@ -116,16 +120,20 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         pose_covariance: alignment.covariance,
         u_calibration_mm: request.recipe.u_calibration_mm,
         u_calibration_rad: request.recipe.u_calibration_rad,
+        flank_mm: request.recipe.flank_mm,
+        depth_mm: request.recipe.depth_mm,
+        expansion: expansion(request, &mut findings),
     };
-    let measured = measure_edges(&part, &places, &surface, &settings);
+    let facts = all_edge_facts(nominal);
+    let resolved = resolve(&facts, request.recipe, &mut findings);
+    let steps: Vec<Option<f64>> = resolved.iter().map(|r| r.station_step_mm).collect();
+    let measured = measure_edges_stepped(&part, &places, &surface, &settings, &steps);
     stages.begin("comparison of edges found");
     let known = (scan.spacing, scan.noise_mm);
     let detection = features::detect_knowing(cloud, &neighbors, known, Method::Adaptive);
     let edges = nominal.edges();
     let compared = compare::compare(&part, &detection, nominal, (&edges, &measured));
 
-    let facts = all_edge_facts(nominal);
-    let resolved = resolve(&facts, request.recipe, &mut findings);
     let results: Vec<EdgeResult> = edges
         .iter()
         .zip(measured)
@@ -242,6 +250,24 @@ fn compared_verdict(
     let counts = (missing && recipe.missing_edges_count)
         || (!compared.unexpected.is_empty() && recipe.unexpected_edges_count);
     counts.then_some(Verdict::NotOk)
+}
+
+/// The expansion to correct for: that of the recipe at the temperature of the request.
+fn expansion(request: &Request<'_>, findings: &mut Vec<String>) -> Option<measure::Expansion> {
+    let asked = request.recipe.expansion?;
+    let Some(temperature_c) = request.temperature_c else {
+        findings.push(
+            "temperature of the part: nobody said, expected it for the correction of its expansion; nothing is corrected"
+                .to_owned(),
+        );
+        return None;
+    };
+    Some(measure::Expansion {
+        coefficient_per_k: asked.coefficient_per_k,
+        u_coefficient_per_k: asked.u_coefficient_per_k,
+        temperature_c,
+        u_temperature_k: asked.u_temperature_k,
+    })
 }
 
 /// Nothing is decided outside the temperatures of the recipe, or where nobody knows the temperature.

@@ -43,6 +43,9 @@ const SETTINGS: MeasureSettings = MeasureSettings {
     pose_covariance: [[0.0; 6]; 6],
     u_calibration_mm: 0.0,
     u_calibration_rad: 0.0,
+    flank_mm: None,
+    depth_mm: None,
+    expansion: None,
 };
 
 /// Measures a cloud that lies in the part frame exactly.

@@ -101,6 +101,7 @@ pub fn at_station(
         u: measured.u_d_mm[i],
     };
     match quantity {
+        Quantity::Total => Some(measured.total_mm),
         Quantity::D1 => Some(d(0)),
         Quantity::D2 => Some(d(1)),
         Quantity::AngleDeviation => Some(Quantified {

@@ -5,6 +5,7 @@ use rayon::prelude::*;
 
 use super::assign::{NO_FACE, Place};
 use super::body::{Body, BodyEdge};
+use super::edge_break::ZonePoint;
 use super::flank::{FlankPoint, FlankPoints, NO_LINE, Windows};
 use crate::nominal::Station;
 use crate::points::PointCloud;
@@ -72,6 +73,19 @@ impl Track {
             r: offset.dot(frame.into_face[side]),
             distance: (offset - inside * frame.tangent).length(),
         })
+    }
+
+    /// Distances of `p` from the edge into the two faces.
+    fn into_faces(&self, p: DVec3) -> [f64; 2] {
+        let mut found = Vec::new();
+        self.tree.nearest(p, 1, &mut found);
+        match found.first() {
+            Some((index, _)) => {
+                let frame = &self.frames[*index as usize];
+                frame.into_face.map(|b| (p - frame.point).dot(b))
+            }
+            None => [0.0; 2],
+        }
     }
 
     /// Whether arc length `s` lies between the ends of the edge, a rounding error apart.
@@ -176,6 +190,72 @@ fn block_of(
         }
     }
     out
+}
+
+/// The points within `radius_mm[edge]` of every edge, on either of its faces, in order of arc length: at most `limit` a stretch of
+/// `stretch_mm[edge]`, evenly chosen.
+pub(super) fn zones<B: Body>(
+    scene: &Scene<'_>,
+    body: &B,
+    radius_mm: &[f64],
+    stretch_mm: &[f64],
+    limit: usize,
+) -> Vec<Vec<ZonePoint>> {
+    let nearby = |e: usize| -> Vec<(f64, u32, usize)> {
+        let mut found = Vec::new();
+        let mut near = Vec::new();
+        if radius_mm[e] <= 0.0 {
+            return near;
+        }
+        let [first, second] = scene.edges[e].faces;
+        let sides = if first == second { 1 } else { 2 };
+        for side in 0..sides {
+            for &i in &scene.by_face[scene.edges[e].faces[side] as usize] {
+                let p = scene.cloud.positions[i as usize];
+                if let Some(seen) = scene.tracks[e].seen(p, side, radius_mm[e], &mut found)
+                    && seen.distance <= radius_mm[e]
+                    && scene.tracks[e].covers(seen.s)
+                {
+                    near.push((seen.s, i, side));
+                }
+            }
+        }
+        near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        near
+    };
+    let place = |e: usize, (s, i, side): (f64, u32, usize)| -> Option<ZonePoint> {
+        let p = scene.cloud.positions[i as usize];
+        let own = scene.places[i as usize].deviation_mm;
+        let foot = body.foot(scene.edges[e].faces[1 - side], p, None)?;
+        let other = (p - foot.point).dot(foot.normal);
+        Some(ZonePoint {
+            s,
+            r: scene.tracks[e].into_faces(p),
+            deviation: if side == 0 {
+                [own, other]
+            } else {
+                [other, own]
+            },
+        })
+    };
+    (0..scene.edges.len())
+        .into_par_iter()
+        .map(|e| {
+            let near = nearby(e);
+            let stretch = |s: f64| (s / stretch_mm[e]) as usize;
+            let mut points = Vec::new();
+            for group in near.chunk_by(|a, b| stretch(a.0) == stretch(b.0)) {
+                let step = group.len().div_ceil(limit).max(1);
+                points.extend(
+                    group
+                        .iter()
+                        .step_by(step)
+                        .filter_map(|found| place(e, *found)),
+                );
+            }
+            points
+        })
+        .collect()
 }
 
 /// The scan line of a point, one number for a profile of a view.

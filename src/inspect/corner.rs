@@ -5,7 +5,8 @@
 use glam::{DMat3, DVec3};
 
 use super::body::{Body, BodyEdge};
-use super::measure::{pose_row, quadratic};
+use super::contributions::quadratic;
+use super::measure::pose_row;
 use super::result::{CornerResult, EdgeResult, Quantified, StationResult};
 use super::verdict::{Rule, judge};
 

@@ -83,6 +83,29 @@ pub struct FlankSettings {
     pub spacing_mm: f64,
     /// Fewest points that count as a flank.
     pub min_points: usize,
+    /// Whether the design of every fit is kept, for [`FlankSeries::designs`].
+    pub keep_designs: bool,
+}
+
+/// What the deviation of a flank from its nominal face is modelled by; the data of the edge choose.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum FlankModel {
+    /// Offset, tilt across and slope along the edge: of a plane face a plane, of any other the nominal face displaced.
+    #[default]
+    Displaced,
+    /// A bend across the edge as well: of a plane face a quadric.
+    Bent,
+}
+
+/// The linear map from the points of one fit to (offset, tilt), for redrawing them: see [`super::monte_carlo`].
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Design {
+    /// What one point moves (offset, tilt) by, per mm.
+    pub influence: Vec<[f64; 2]>,
+    /// Groups of points that share noise: (group, influence of the group).
+    pub groups: Vec<(u32, [f64; 2])>,
+    /// Standard deviations of a point's own and of its group's noise, mm.
+    pub sigma_mm: [f64; 2],
 }
 
 /// The flank at one station.
@@ -92,6 +115,10 @@ pub struct FlankFit {
     pub offset_mm: f64,
     /// Change of the deviation per mm into the face.
     pub tilt: f64,
+    /// Change of the deviation per mm along the edge.
+    pub slope: f64,
+    /// Coefficient of the square of the distance into the face, 1/mm; 0 where the flank is not bent.
+    pub bend: f64,
     /// Covariance of (offset, tilt), all that the data show: noise, correlated noise, lack of fit.
     pub covariance: [[f64; 2]; 2],
     /// Standard deviation of one point, mm.
@@ -102,6 +129,13 @@ pub struct FlankFit {
     pub cut_mm: f64,
     /// Whether the residuals hold more than noise.
     pub lack_of_fit: bool,
+}
+
+impl FlankFit {
+    /// Deviation from the nominal face at distance `r` into the face and `s` along the edge from the station, mm.
+    pub fn deviation_mm(&self, r: f64, s: f64) -> f64 {
+        self.offset_mm + (self.tilt + self.bend * r) * r + self.slope * s
+    }
 }
 
 /// Why a flank was not measured at a station.
@@ -131,8 +165,12 @@ pub struct FlankSeries {
     pub stations: Vec<Result<FlankFit, FlankGap>>,
     /// Distance from the edge up to which points were used, mm.
     pub reach_mm: f64,
-    /// Whether the model needed a term in r squared.
-    pub bent: bool,
+    /// The model that the edge needed.
+    pub model: FlankModel,
+    /// Whether the transition zone takes more than half of the reach somewhere and the reach could grow no further.
+    pub too_wide: bool,
+    /// The design of every station's fit; empty unless asked for.
+    pub designs: Vec<Design>,
     /// Variance of the mean offset over the stations, over what it would be if stations shared nothing. They share scan
     /// lines that run along the edge, and form deviation.
     pub shared_factor: f64,
@@ -148,17 +186,24 @@ pub fn measure_flank(
     windows: &Windows,
     settings: &FlankSettings,
 ) -> FlankSeries {
-    let (reach, cuts) = settle_cuts::<4>(points, windows, settings);
-    let bent = fit_series::<4>(points, windows, &reach, &cuts);
+    let settled = settle_cuts::<4>(points, windows, settings);
+    let bent = fit_series::<4>(points, windows, &settled);
     if bend_is_significant(&bent) {
-        let richer = fit_series::<5>(points, windows, &reach, &cuts);
-        return finish(bent, &richer, &reach, true);
+        let richer = fit_series::<5>(points, windows, &settled);
+        return finish(bent, &richer, &settled, FlankModel::Bent);
     }
     // A straight flank is extrapolated with less noise, so its transition zone is seen more sharply.
-    let (reach, cuts) = settle_cuts::<3>(points, windows, settings);
-    let straight = fit_series::<3>(points, windows, &reach, &cuts);
-    let richer = fit_series::<4>(points, windows, &reach, &cuts);
-    finish(straight, &richer, &reach, false)
+    let settled = settle_cuts::<3>(points, windows, settings);
+    let straight = fit_series::<3>(points, windows, &settled);
+    let richer = fit_series::<4>(points, windows, &settled);
+    finish(straight, &richer, &settled, FlankModel::Displaced)
+}
+
+/// The range that every station uses.
+struct Settled {
+    settings: FlankSettings,
+    cuts: Vec<f64>,
+    too_wide: bool,
 }
 
 /// The settings with the reach that the transition zone demands, and the cut of every station.
@@ -166,14 +211,18 @@ fn settle_cuts<const P: usize>(
     points: &FlankPoints,
     windows: &Windows,
     settings: &FlankSettings,
-) -> (FlankSettings, Vec<f64>) {
+) -> Settled {
     let mut settings = *settings;
     loop {
         let cuts = transition::find_cuts::<P>(points, windows, &settings);
         let wide = cuts.iter().flatten().any(|c| c.too_wide);
         if !wide || settings.reach_mm >= settings.reach_limit_mm {
             let cut_of = |c: &Option<transition::Cut>| c.map_or(settings.cut_mm, |c| c.cut_mm);
-            return (settings, cuts.iter().map(cut_of).collect());
+            return Settled {
+                settings,
+                cuts: cuts.iter().map(cut_of).collect(),
+                too_wide: wide,
+            };
         }
         settings.reach_mm = (2.0 * settings.reach_mm).min(settings.reach_limit_mm);
     }
@@ -187,6 +236,8 @@ struct WindowFit<const P: usize> {
     cut_mm: f64,
     lines: Clusters<P>,
     cells: Clusters<P>,
+    /// (row, line, cell) of every point kept; empty unless designs are wanted.
+    used: Vec<([f64; P], u32, u32)>,
 }
 
 type Series<const P: usize> = Vec<Result<WindowFit<P>, FlankGap>>;
@@ -199,18 +250,18 @@ fn row<const P: usize>(r: f64, s: f64) -> [f64; P] {
 fn fit_series<const P: usize>(
     points: &FlankPoints,
     windows: &Windows,
-    settings: &FlankSettings,
-    cuts: &[f64],
+    settled: &Settled,
 ) -> Series<P> {
+    let settings = &settled.settings;
     (0..windows.count)
         .map(|k| {
             let range = Range {
                 centre: windows.centre(k),
                 width: windows.step_mm,
-                cut_mm: cuts[k],
+                cut_mm: settled.cuts[k],
                 reach_mm: settings.reach_mm,
             };
-            fit_window(points, &range, settings.min_points)
+            fit_window(points, &range, settings)
         })
         .collect()
 }
@@ -239,8 +290,9 @@ impl Range {
 fn fit_window<const P: usize>(
     points: &FlankPoints,
     range: &Range,
-    min_points: usize,
+    settings: &FlankSettings,
 ) -> Result<WindowFit<P>, FlankGap> {
+    let min_points = settings.min_points;
     let indices = range.indices(points);
     if indices.is_empty() {
         return Err(FlankGap::NoPoints);
@@ -267,7 +319,14 @@ fn fit_window<const P: usize>(
     };
     let residual = |k: usize| values[k] - robust.fit.predict(&rows[k]);
     let sample = |k: &usize, group: u32| (group, rows[*k], residual(*k));
+    let used = if settings.keep_designs {
+        let of = |k: &usize| (rows[*k], line(*k), cell(*k));
+        kept.iter().map(of).collect()
+    } else {
+        Vec::new()
+    };
     Ok(WindowFit {
+        used,
         lines: Clusters::new(kept.iter().map(|k| sample(k, line(*k))), &robust.fit),
         cells: Clusters::new(kept.iter().map(|k| sample(k, cell(*k))), &robust.fit),
         fit: robust.fit,
@@ -324,12 +383,22 @@ fn bend_is_significant(series: &Series<4>) -> bool {
 fn finish<const P: usize, const Q: usize>(
     series: Series<P>,
     richer: &Series<Q>,
-    settings: &FlankSettings,
-    bent: bool,
+    settled: &Settled,
+    model: FlankModel,
 ) -> FlankSeries {
     let noise = variance::estimate(&series);
     let form = variance::form_factors(&series, richer, &noise);
     let shared_factor = variance::shared_factor(&series, &noise, &form);
+    let designs = if settled.settings.keep_designs {
+        let each = series.iter().zip(noise.iter().zip(&form));
+        each.map(|(window, (noise, form))| match window {
+            Ok(window) => noise.design(window, *form),
+            Err(_) => Design::default(),
+        })
+        .collect()
+    } else {
+        Vec::new()
+    };
     let stations = series
         .into_iter()
         .zip(noise.iter().zip(form))
@@ -343,6 +412,11 @@ fn finish<const P: usize, const Q: usize>(
             Ok(FlankFit {
                 offset_mm: window.fit.coefficients[0],
                 tilt: window.fit.coefficients[1],
+                slope: window.fit.coefficients[2],
+                bend: match model {
+                    FlankModel::Displaced => 0.0,
+                    FlankModel::Bent => window.fit.coefficients[3],
+                },
                 covariance,
                 sigma_mm: window.sigma,
                 points: window.fit.used,
@@ -353,8 +427,10 @@ fn finish<const P: usize, const Q: usize>(
         .collect();
     FlankSeries {
         stations,
-        reach_mm: settings.reach_mm,
-        bent,
+        reach_mm: settled.settings.reach_mm,
+        model,
+        too_wide: settled.too_wide,
+        designs,
         shared_factor,
     }
 }

@@ -6,11 +6,18 @@ use rayon::prelude::*;
 use super::assign::{Place, Surface};
 use super::body::{Body, BodyEdge};
 use super::collect::{self, Scene, Track};
-use super::flank::{FlankFit, FlankGap, FlankSeries, FlankSettings, Windows, measure_flank};
-use super::result::{Budget, EdgeBreak, EdgeMean, Measured};
-use super::virtual_edge::{VirtualEdge, intersect};
-use crate::nominal::Station;
+use super::contributions::{Response, Shared};
+use super::edge_break::{self, Found, POINTS_MAX, STRETCH, Stretch, Wedge, ZonePoint};
+use super::flank::{
+    FlankFit, FlankGap, FlankModel, FlankSeries, FlankSettings, Windows, measure_flank,
+};
+use super::result::{Budget, DepthPoint, EdgeBreak, EdgeMean, EdgePoint, Measured, Quantified};
+use super::virtual_edge::{VirtualEdge, intersect, nominal_angle};
+use crate::nominal::{EdgeKind, Station};
 use crate::points::PointCloud;
+
+pub use super::contributions::Expansion;
+pub(super) use super::contributions::pose_row;
 
 /// Points that a flank of a station aims at: its offset is then known to a seventh of the noise.
 const WANTED_POINTS: f64 = 200.0;
@@ -41,6 +48,12 @@ pub struct MeasureSettings {
     pub u_calibration_mm: f64,
     /// Standard uncertainty of the included angle from the sensor's calibration, rad.
     pub u_calibration_rad: f64,
+    /// Depth of the flanks that are used, mm; `None` = derived from the spacing and grown where the edge break is wide.
+    pub flank_mm: Option<f64>,
+    /// Depth at which the edge is to be given as well, mm.
+    pub depth_mm: Option<f64>,
+    /// Expansion of the part against its drawing; `None` = measured at 20 degrees, known exactly.
+    pub expansion: Option<Expansion>,
 }
 
 /// One edge as measured, not judged yet.
@@ -50,6 +63,8 @@ pub struct MeasuredEdge {
     pub stations: Vec<MeasuredStation>,
     /// The shape of the edge itself, one a stretch.
     pub breaks: Vec<EdgeBreak>,
+    /// What the deviation of each flank was modelled by.
+    pub flank_model: [FlankModel; 2],
     /// Mean of d1 and d2 over the measured stations and their standard uncertainties, mm; `None` where none was measured.
     pub mean: Option<EdgeMean>,
     /// What was peculiar, for the findings.
@@ -74,17 +89,74 @@ pub fn measure_edges<B: Body>(
     surface: &Surface<'_, B>,
     settings: &MeasureSettings,
 ) -> Vec<MeasuredEdge> {
+    measure_edges_stepped(cloud, places, surface, settings, &[])
+}
+
+/// As [`measure_edges`], with a distance of stations (mm) of its own for every edge that has one in `steps_mm`.
+pub fn measure_edges_stepped<B: Body>(
+    cloud: &PointCloud,
+    places: &[Place],
+    surface: &Surface<'_, B>,
+    settings: &MeasureSettings,
+    steps_mm: &[Option<f64>],
+) -> Vec<MeasuredEdge> {
+    with_flanks(
+        cloud,
+        places,
+        surface,
+        (settings, steps_mm),
+        false,
+        |flanks| {
+            let context = flanks.context;
+            let zones = flanks.zones();
+            (0..flanks.series.len())
+                .into_par_iter()
+                .map(|e| context(e).combine(&flanks.windows[e], &flanks.series[e], &zones[e]))
+                .collect()
+        },
+    )
+}
+
+/// All flanks of a scan, with what is needed to combine them.
+pub(super) struct Flanks<'a, B: Body> {
+    pub(super) scene: &'a Scene<'a>,
+    pub(super) windows: &'a [Windows],
+    pub(super) series: &'a [[FlankSeries; 2]],
+    pub(super) context: &'a (dyn Fn(usize) -> EdgeContext<'a, B> + Sync),
+    body: &'a B,
+    spacing_mm: f64,
+}
+
+/// Fits all flanks and hands them to `then`.
+pub(super) fn with_flanks<B: Body, T>(
+    cloud: &PointCloud,
+    places: &[Place],
+    surface: &Surface<'_, B>,
+    (settings, steps_mm): (&MeasureSettings, &[Option<f64>]),
+    keep_designs: bool,
+    then: impl FnOnce(&Flanks<'_, B>) -> T,
+) -> T {
     let edges = surface.body.edges();
-    let windows: Vec<Windows> = edges.iter().map(|e| windows_of(e, settings)).collect();
-    let flank_settings: Vec<FlankSettings> = windows
+    let windows: Vec<Windows> = edges
         .iter()
-        .map(|w| flank_settings(w, settings))
+        .enumerate()
+        .map(|(e, edge)| windows_of(edge, steps_mm.get(e).copied().flatten(), settings))
+        .collect();
+    let flank_settings: Vec<FlankSettings> = (0..edges.len())
+        .map(|e| {
+            let middle = surface.body.station(e, 0.5 * edges[e].length_mm);
+            let angle = nominal_angle(&middle, edges[e].kind);
+            FlankSettings {
+                keep_designs,
+                ..flank_settings(&windows[e], angle, settings)
+            }
+        })
         .collect();
     let tracks: Vec<Track> = (0..edges.len())
         .into_par_iter()
         .map(|e| Track::new(surface.body, e, &edges[e], &windows[e]))
         .collect();
-    let radius: Vec<f64> = flank_settings.iter().map(|s| s.reach_limit_mm).collect();
+    let radius: Vec<f64> = flank_settings.iter().map(|s| s.reach_mm).collect();
     let scene = Scene {
         cloud,
         places,
@@ -94,27 +166,76 @@ pub fn measure_edges<B: Body>(
         by_face: &collect::by_face(places, surface.body.face_count()),
     };
     let series = all_flanks(&scene, &windows, &flank_settings);
-    (0..edges.len())
-        .into_par_iter()
-        .map(|e| {
-            let context = EdgeContext {
-                body: surface.body,
-                index: e,
-                edge: &edges[e],
-                settings,
-            };
-            context.combine(&windows[e], &series[e])
-        })
-        .collect()
+    let shared = Shared {
+        pose_covariance: settings.pose_covariance,
+        u_calibration_mm: settings.u_calibration_mm,
+        expansion: settings.expansion,
+        centre: centre(&scene),
+    };
+    let context = |e: usize| EdgeContext {
+        body: surface.body,
+        index: e,
+        edge: &edges[e],
+        settings,
+        shared,
+    };
+    then(&Flanks {
+        scene: &scene,
+        windows: &windows,
+        series: &series,
+        context: &context,
+        body: surface.body,
+        spacing_mm: settings.along_mm,
+    })
+}
+
+/// The mean of the points that lie on the part: what a least-squares pose holds.
+fn centre(scene: &Scene<'_>) -> DVec3 {
+    let (mut sum, mut count) = (DVec3::ZERO, 0.0);
+    for list in scene.by_face {
+        for i in list {
+            sum += scene.cloud.positions[*i as usize];
+            count += 1.0;
+        }
+    }
+    sum / f64::max(count, 1.0)
+}
+
+impl<B: Body> Flanks<'_, B> {
+    /// The points of every edge's transition zone.
+    fn zones(&self) -> Vec<Vec<ZonePoint>> {
+        let radius = |pair: &[FlankSeries; 2]| {
+            let fits = || pair.iter().flat_map(|s| s.stations.iter().flatten());
+            let cut = fits().map(|f| f.cut_mm).fold(0.0, f64::max);
+            let off = fits().map(|f| f.offset_mm.abs()).fold(0.0, f64::max);
+            let seen = pair.iter().all(|s| s.stations.iter().any(Result::is_ok));
+            let reach = Stretch::reach_of(cut, self.spacing_mm);
+            if seen {
+                reach + 2.0 * off.min(reach)
+            } else {
+                0.0
+            }
+        };
+        let radius: Vec<f64> = self.series.iter().map(radius).collect();
+        let stretch: Vec<f64> = self
+            .windows
+            .iter()
+            .map(|w| STRETCH as f64 * w.step_mm)
+            .collect();
+        collect::zones(self.scene, self.body, &radius, &stretch, POINTS_MAX)
+    }
 }
 
 /// Stations about as long as needed for [`WANTED_POINTS`] and [`LINES`], a whole number of them on the edge.
-fn windows_of(edge: &BodyEdge, settings: &MeasureSettings) -> Windows {
+fn windows_of(edge: &BodyEdge, step_mm: Option<f64>, settings: &MeasureSettings) -> Windows {
     let area = settings.along_mm * settings.across_mm;
     let derived = (WANTED_POINTS * area / DEPTH)
         .sqrt()
         .max(LINES * settings.across_mm);
-    let step = settings.station_step_mm.unwrap_or(derived).max(1e-9);
+    let step = step_mm
+        .or(settings.station_step_mm)
+        .unwrap_or(derived)
+        .max(1e-9);
     // No more than a hundred thousand stations, whatever the step.
     let count = (edge.length_mm / step).round().clamp(1.0, 1e5);
     Windows {
@@ -123,10 +244,14 @@ fn windows_of(edge: &BodyEdge, settings: &MeasureSettings) -> Windows {
     }
 }
 
-fn flank_settings(windows: &Windows, settings: &MeasureSettings) -> FlankSettings {
+fn flank_settings(
+    windows: &Windows,
+    included_angle_rad: f64,
+    settings: &MeasureSettings,
+) -> FlankSettings {
     let area = settings.along_mm * settings.across_mm;
     // A short edge or a given step makes the window narrow; the reach then makes up for the points.
-    let reach_mm = (DEPTH * windows.step_mm)
+    let derived = (DEPTH * windows.step_mm)
         .max(WANTED_POINTS * area / windows.step_mm)
         .min(
             DEPTH
@@ -134,16 +259,17 @@ fn flank_settings(windows: &Windows, settings: &MeasureSettings) -> FlankSetting
                     .sqrt()
                     .max(LINES * settings.across_mm),
         );
-    // Points nearer than this may be mixed with, or belong to, the other flank.
-    let cut_mm = (2.0 * settings.along_mm)
-        .max(4.0 * settings.noise_mm)
-        .min(0.2 * reach_mm);
+    let reach_mm = settings.flank_mm.unwrap_or(derived).max(1e-9);
+    // Noise takes points nearer than this over the bisector to the other flank; the search for the transition zone does the rest.
+    let half = 0.5 * included_angle_rad.min(std::f64::consts::TAU - included_angle_rad);
+    let mixed = 4.0 * settings.noise_mm / half.tan().clamp(0.1, 1.0);
     FlankSettings {
         reach_mm,
-        reach_limit_mm: 4.0 * reach_mm,
-        cut_mm,
+        reach_limit_mm: settings.flank_mm.unwrap_or(4.0 * reach_mm),
+        cut_mm: mixed.max(0.5 * settings.along_mm).min(0.2 * reach_mm),
         spacing_mm: settings.along_mm.max(1e-9),
         min_points: 12,
+        keep_designs: false,
     }
 }
 
@@ -154,17 +280,50 @@ fn all_flanks(
     windows: &[Windows],
     settings: &[FlankSettings],
 ) -> Vec<[FlankSeries; 2]> {
-    let measure = |wanted: &[usize], cuts: &[[f64; 2]]| -> Vec<[FlankSeries; 2]> {
+    let measure = |wanted: &[usize],
+                   cuts: &[[f64; 2]],
+                   scene: &Scene<'_>,
+                   settings: &[FlankSettings]| {
         let points = collect::flanks(scene, wanted, cuts);
         wanted
             .par_iter()
             .zip(points.par_iter())
             .map(|(e, pair)| [0, 1].map(|i| measure_flank(&pair[i], &windows[*e], &settings[*e])))
-            .collect()
+            .collect::<Vec<[FlankSeries; 2]>>()
     };
+    // First without room to grow: few edges need it.
+    let narrow: Vec<FlankSettings> = settings
+        .iter()
+        .map(|s| FlankSettings {
+            reach_limit_mm: s.reach_mm,
+            ..*s
+        })
+        .collect();
     let assumed: Vec<[f64; 2]> = settings.iter().map(|s| [2.0 * s.cut_mm; 2]).collect();
     let all: Vec<usize> = (0..settings.len()).collect();
-    let mut series = measure(&all, &assumed);
+    let mut series = measure(&all, &assumed, scene, &narrow);
+    let wide: Vec<bool> = series
+        .iter()
+        .map(|pair| pair.iter().any(|s| s.too_wide))
+        .collect();
+    let grown = |e: usize| {
+        if wide[e] {
+            settings[e].reach_limit_mm
+        } else {
+            settings[e].reach_mm
+        }
+    };
+    let room: Vec<f64> = (0..settings.len()).map(grown).collect();
+    let ample: Vec<FlankSettings> = (0..settings.len())
+        .map(|e| FlankSettings {
+            reach_limit_mm: room[e],
+            ..settings[e]
+        })
+        .collect();
+    let scene = &Scene {
+        radius_mm: &room,
+        ..*scene
+    };
     let widest = |s: &FlankSeries| {
         s.stations
             .iter()
@@ -185,44 +344,61 @@ fn all_flanks(
     }
     let again: Vec<usize> = all
         .into_iter()
-        .filter(|e| scene.edges[*e].faces.iter().any(|f| disturbed[*f as usize]))
+        .filter(|e| {
+            let near = scene.edges[*e].faces.iter().any(|f| disturbed[*f as usize]);
+            near || (wide[*e] && settings[*e].reach_limit_mm > settings[*e].reach_mm)
+        })
         .collect();
-    for (e, pair) in again.iter().zip(measure(&again, &seen)) {
+    for (e, pair) in again.iter().zip(measure(&again, &seen, scene, &ample)) {
         series[*e] = pair;
     }
     series
 }
 
 /// What is needed to combine the flanks of one edge.
-struct EdgeContext<'a, B: Body> {
+pub(super) struct EdgeContext<'a, B: Body> {
     body: &'a B,
     index: usize,
     edge: &'a BodyEdge,
     settings: &'a MeasureSettings,
+    pub(super) shared: Shared,
 }
 
 impl<B: Body> EdgeContext<'_, B> {
-    fn combine(&self, windows: &Windows, series: &[FlankSeries; 2]) -> MeasuredEdge {
+    fn combine(
+        &self,
+        windows: &Windows,
+        series: &[FlankSeries; 2],
+        zone: &[ZonePoint],
+    ) -> MeasuredEdge {
         let mut stations = Vec::with_capacity(windows.count);
+        let mut edges: Vec<Option<VirtualEdge>> = Vec::with_capacity(windows.count);
         let mut sum = MeanSum::default();
         for k in 0..windows.count {
-            let station = self.body.station(self.index, windows.centre(k));
+            let station = self.station(windows, k);
             let flanks = [&series[0].stations[k], &series[1].stations[k]];
             let points = flanks.map(|f| match f {
                 Ok(fit) => fit.points,
                 Err(FlankGap::TooFew(seen, _)) => *seen,
                 Err(_) => 0,
             });
+            let mut edge = None;
             let outcome = match flanks {
-                [Ok(first), Ok(second)] => self
-                    .virtual_edge(&station, [first, second])
-                    .map(|edge| {
-                        sum.add(&station, &edge);
-                        self.measured(&station, &edge, [first, second])
+                [Ok(first), Ok(second)] => {
+                    edge = self.virtual_edge(&station, [first, second]);
+                    edge.map(|edge| {
+                        let models = [series[0].model, series[1].model];
+                        let reach = [series[0].reach_mm, series[1].reach_mm];
+                        let measured =
+                            self.measured(&station, &edge, [first, second], models, reach);
+                        sum.add(&self.shared, &station, &edge, &measured);
+                        measured
                     })
-                    .ok_or_else(|| PARALLEL.to_string()),
+                    .ok_or_else(|| PARALLEL.to_string())
+                }
                 _ => Err(self.reason(flanks)),
             };
+            edges.push(edge);
             stations.push(MeasuredStation {
                 station,
                 outcome,
@@ -230,14 +406,23 @@ impl<B: Body> EdgeContext<'_, B> {
             });
         }
         MeasuredEdge {
+            breaks: self.breaks(windows, series, zone, &edges, &mut stations),
+            flank_model: [series[0].model, series[1].model],
             stations,
-            breaks: Vec::new(),
             mean: self.mean(&sum, series),
             remarks: self.remarks(series),
         }
     }
 
-    fn virtual_edge(&self, station: &Station, flanks: [&FlankFit; 2]) -> Option<VirtualEdge> {
+    pub(super) fn station(&self, windows: &Windows, k: usize) -> Station {
+        self.body.station(self.index, windows.centre(k))
+    }
+
+    pub(super) fn virtual_edge(
+        &self,
+        station: &Station,
+        flanks: [&FlankFit; 2],
+    ) -> Option<VirtualEdge> {
         intersect(station, self.edge.kind, flanks, |i, p| {
             let height = (p - station.point).dot(station.normals[i]);
             let Some(foot) = self.body.foot(self.edge.faces[i], p, None) else {
@@ -253,34 +438,137 @@ impl<B: Body> EdgeContext<'_, B> {
         })
     }
 
-    fn measured(&self, station: &Station, edge: &VirtualEdge, flanks: [&FlankFit; 2]) -> Measured {
-        let pose = [0, 1].map(|i| {
-            let row = pose_row(edge.point, station.normals[i]);
-            quadratic(&row, &self.settings.pose_covariance, &row)
+    fn measured(
+        &self,
+        station: &Station,
+        edge: &VirtualEdge,
+        flanks: [&FlankFit; 2],
+        models: [FlankModel; 2],
+        reach_mm: [f64; 2],
+    ) -> Measured {
+        let response = station.normals.map(|n| self.shared.response(edge.point, n));
+        let calibration = self.shared.u_calibration_mm;
+        let budget_d = [0, 1].map(|i| {
+            let [alignment, temperature] = self.shared.u(&response[i]);
+            Budget {
+                points: edge.covariance[i][i].sqrt(),
+                alignment,
+                calibration,
+                temperature,
+            }
         });
-        let budget_d = [0, 1].map(|i| Budget {
-            points: edge.covariance[i][i].sqrt(),
-            alignment: pose[i].max(0.0).sqrt(),
-            calibration: self.settings.u_calibration_mm,
-            temperature: 0.0,
-        });
-        // A rigid motion changes no angle.
+        // Neither a rigid motion nor an even growth changes an angle.
         let budget_angle = Budget {
             points: edge.covariance[2][2].sqrt(),
             alignment: 0.0,
             calibration: self.settings.u_calibration_rad,
             temperature: 0.0,
         };
+        let correction = self.shared.correction(edge.point);
+        let d_mm = [0, 1].map(|i| edge.d_mm[i] + correction.dot(station.normals[i]));
+        // The two flanks are calibrated in different directions, so that their errors count as independent.
+        let shared: f64 = self
+            .shared
+            .covariance(&response[0], &response[1])
+            .iter()
+            .sum();
+        let covariance_d_mm2 = edge.covariance[0][1] + shared;
+        let u_d_mm = budget_d.map(|budget| budget.u());
         Measured {
-            point: edge.point,
-            d_mm: edge.d_mm,
-            u_d_mm: budget_d.map(|budget| budget.u()),
+            point: edge.point + correction,
+            d_mm,
+            u_d_mm,
             included_angle_rad: edge.included_angle_rad,
             u_included_angle_rad: budget_angle.u(),
             residual_mm: flanks.map(|f| f.sigma_mm),
+            total_mm: total(station, d_mm, u_d_mm, covariance_d_mm2),
             budget_d,
             budget_angle,
+            covariance_d_mm2,
+            flank_model: models,
+            ridge: None,
+            at_depth: [0, 1].map(|i| self.at_depth(station, edge, flanks[i], i, reach_mm[i])),
         }
+    }
+
+    /// The place on flank `i` at the depth asked for: from the virtual edge into the face.
+    fn at_depth(
+        &self,
+        station: &Station,
+        edge: &VirtualEdge,
+        flank: &FlankFit,
+        i: usize,
+        reach_mm: f64,
+    ) -> Option<DepthPoint> {
+        let [n, b] = [station.normals[i], station.into_face[i]];
+        let depth = self.settings.depth_mm?;
+        let r = (edge.point - station.point).dot(b) + depth;
+        if r < flank.cut_mm || r > reach_mm {
+            return None;
+        }
+        let value = flank.deviation_mm(r, 0.0);
+        let foot = self
+            .body
+            .foot(self.edge.faces[i], station.point + r * b, None)?;
+        let point = foot.point + value * foot.normal;
+        let correction = self.shared.correction(point);
+        let c = &flank.covariance;
+        let fit = c[0][0] + 2.0 * r * c[0][1] + r * r * c[1][1];
+        let common = self.shared.u(&self.shared.response(point, n));
+        let variance =
+            fit + self.shared.u_calibration_mm.powi(2) + common.iter().map(|u| u * u).sum::<f64>();
+        Some(DepthPoint {
+            point: point + correction,
+            d_mm: Quantified {
+                value: value + correction.dot(n),
+                u: variance.sqrt(),
+            },
+        })
+    }
+
+    /// The breaks of all stretches; gives the stations of each their ridge.
+    fn breaks(
+        &self,
+        windows: &Windows,
+        series: &[FlankSeries; 2],
+        zone: &[ZonePoint],
+        edges: &[Option<VirtualEdge>],
+        stations: &mut [MeasuredStation],
+    ) -> Vec<EdgeBreak> {
+        let mut breaks = Vec::new();
+        for first in (0..windows.count).step_by(STRETCH) {
+            let range = first..(first + STRETCH).min(windows.count);
+            let wedge = |k: usize| match (&series[0].stations[k], &series[1].stations[k], edges[k])
+            {
+                (Ok(a), Ok(b), Some(edge)) => Some(Wedge {
+                    s: windows.centre(k),
+                    flanks: [a, b],
+                    included_angle_rad: edge.included_angle_rad,
+                }),
+                _ => None,
+            };
+            let from = first as f64 * windows.step_mm;
+            let to = range.end as f64 * windows.step_mm;
+            let points = zone.partition_point(|p| p.s < from)..zone.partition_point(|p| p.s < to);
+            let stretch = Stretch {
+                wedges: range.clone().filter_map(wedge).collect(),
+                points: &zone[points],
+                step_mm: windows.step_mm,
+                spacing_mm: self.settings.along_mm,
+                convex: self.edge.kind == EdgeKind::Convex,
+                shared_factor: [series[0].shared_factor, series[1].shared_factor],
+            };
+            if stretch.wedges.is_empty() {
+                continue;
+            }
+            if let Some(found) = edge_break::measure_stretch(&stretch) {
+                for station in &mut stations[range] {
+                    add_ridge(station, &found);
+                }
+                breaks.push(found.shape);
+            }
+        }
+        breaks
     }
 
     fn mean(&self, sum: &MeanSum, series: &[FlankSeries; 2]) -> Option<EdgeMean> {
@@ -289,10 +577,10 @@ impl<B: Body> EdgeContext<'_, B> {
         }
         let n = sum.count;
         let u = |i: usize| {
-            let row = sum.pose_rows[i].map(|x| x / n);
-            let pose = quadratic(&row, &self.settings.pose_covariance, &row);
+            let common = self.shared.u(&sum.response[i].over(n));
             let fits = sum.variance[i] / (n * n) * series[i].shared_factor;
-            (fits + pose + self.settings.u_calibration_mm.powi(2)).sqrt()
+            let common = common.iter().map(|u| u * u).sum::<f64>();
+            (fits + common + self.shared.u_calibration_mm.powi(2)).sqrt()
         };
         Some(EdgeMean {
             d_mm: sum.d.map(|d| d / n),
@@ -374,38 +662,67 @@ fn gap_text(gap: &FlankGap) -> String {
     }
 }
 
+/// Distance across the tangent from its two components along the normals, with first-order uncertainty; near zero, where the
+/// distance has no derivative, that of the worse component.
+fn total(station: &Station, d: [f64; 2], u: [f64; 2], covariance: f64) -> Quantified {
+    let c = station.normals[0].dot(station.normals[1]);
+    let sine = (1.0 - c * c).max(1e-12);
+    let value = ((d[0] * d[0] + d[1] * d[1] - 2.0 * c * d[0] * d[1]) / sine)
+        .max(0.0)
+        .sqrt();
+    let worst = u[0].max(u[1]) / sine.sqrt();
+    let by = [d[0] - c * d[1], d[1] - c * d[0]].map(|x| x / (sine * value.max(1e-12)));
+    let variance = by[0].powi(2) * u[0].powi(2)
+        + by[1].powi(2) * u[1].powi(2)
+        + 2.0 * by[0] * by[1] * covariance;
+    Quantified {
+        value,
+        u: if value > worst {
+            variance.max(0.0).sqrt()
+        } else {
+            worst
+        },
+    }
+}
+
+/// Gives a measured station the highest place of its stretch. Its uncertainty is that of the virtual edge and that of the
+/// truncation together, which are no worse than independent: the truncation is measured from the virtual edge.
+fn add_ridge(station: &mut MeasuredStation, found: &Found) {
+    let place = &station.station;
+    let [across, up] = [
+        (place.normals[0] - place.normals[1]).normalize_or_zero(),
+        (place.normals[0] + place.normals[1]).normalize_or_zero(),
+    ];
+    let Ok(measured) = &mut station.outcome else {
+        return;
+    };
+    let shift = found.highest[0] * across + found.highest[1] * up;
+    let d_mm = [0, 1].map(|i| Quantified {
+        value: measured.d_mm[i] + shift.dot(place.normals[i]),
+        u: measured.u_d_mm[i].hypot(found.shape.truncation_mm.u * up.dot(place.normals[i])),
+    });
+    measured.ridge = Some(EdgePoint {
+        point: measured.point + shift,
+        d_mm,
+    });
+}
+
 /// Sums over the measured stations of an edge.
 #[derive(Debug, Default)]
 struct MeanSum {
     count: f64,
     d: [f64; 2],
     variance: [f64; 2],
-    pose_rows: [[f64; 6]; 2],
+    response: [Response; 2],
 }
 
 impl MeanSum {
-    fn add(&mut self, station: &Station, edge: &VirtualEdge) {
+    fn add(&mut self, shared: &Shared, station: &Station, edge: &VirtualEdge, measured: &Measured) {
         self.count += 1.0;
         for i in 0..2 {
-            self.d[i] += edge.d_mm[i];
+            self.d[i] += measured.d_mm[i];
             self.variance[i] += edge.covariance[i][i];
-            let row = pose_row(edge.point, station.normals[i]);
-            for (sum, x) in self.pose_rows[i].iter_mut().zip(row) {
-                *sum += x;
-            }
+            self.response[i].add(&shared.response(edge.point, station.normals[i]));
         }
     }
-}
-
-/// How d along `normal` of a place `p` changes with (rotation vector about the origin, translation) of the scan.
-pub(super) fn pose_row(p: DVec3, normal: DVec3) -> [f64; 6] {
-    let turn = p.cross(normal);
-    [turn.x, turn.y, turn.z, normal.x, normal.y, normal.z]
-}
-
-/// a' C b.
-pub(super) fn quadratic(a: &[f64; 6], c: &[[f64; 6]; 6], b: &[f64; 6]) -> f64 {
-    (0..6)
-        .map(|i| a[i] * (0..6).map(|j| c[i][j] * b[j]).sum::<f64>())
-        .sum()
 }

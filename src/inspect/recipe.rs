@@ -8,6 +8,8 @@
 //! unexpected_edges = "report"       # the default; or "not_ok"
 //! station_step_mm = 1.0             # without it derived from the data
 //! flank_mm = 2.0                    # depth of the flanks; without it derived from the data
+//! depth_mm = 0.5                    # depth at which the edge is given as well; without it only the virtual edge
+//! hold = ["turn_z"]                 # directions in which the part stays as its fixture holds it: turn_x ... shift_z
 //! direction_mm = 5.0                # length over which a direction is taken; without it five stations
 //! u_calibration_mm = 0.002          # standard uncertainty of a flank's place from the sensor's calibration
 //! u_calibration_rad = 0.0           # and of the included angle
@@ -82,6 +84,10 @@ pub struct Recipe {
     pub station_step_mm: Option<f64>,
     /// Depth of the flanks, mm; `None` = derived from the data.
     pub flank_mm: Option<f64>,
+    /// Depth at which the edge is given as well, mm; `None` = not.
+    pub depth_mm: Option<f64>,
+    /// Turns about x, y, z and shifts along x, y, z in which the start's pose stays.
+    pub held: [bool; 6],
     /// Length over which the direction of an edge is taken, mm; `None` = five stations.
     pub direction_mm: Option<f64>,
     /// Standard uncertainty of d from the calibration of the sensor, mm.
@@ -120,6 +126,8 @@ impl Default for Recipe {
             unexpected_edges_count: false,
             station_step_mm: None,
             flank_mm: None,
+            depth_mm: None,
+            held: [false; 6],
             direction_mm: None,
             u_calibration_mm: 0.0,
             u_calibration_rad: 0.0,

@@ -2,6 +2,7 @@
 
 use glam::DVec3;
 
+use super::flank::FlankModel;
 use crate::features::Class;
 use crate::geometry::RigidTransform;
 use crate::nominal::{EdgeKind, Station};
@@ -217,6 +218,35 @@ pub struct Measured {
     pub budget_d: [Budget; 2],
     /// What `u_included_angle_rad` is made of.
     pub budget_angle: Budget,
+    /// Covariance of d1 and d2, mm2, all contributions.
+    pub covariance_d_mm2: f64,
+    /// Distance of the measured edge from the nominal one across the tangent, mm.
+    pub total_mm: Quantified,
+    /// What the deviation of each flank was modelled by.
+    pub flank_model: [FlankModel; 2],
+    /// The highest place of the real profile along the bisector; `None` where the edge itself was not seen.
+    pub ridge: Option<EdgePoint>,
+    /// The edge at the depth asked for: on each flank the place at that distance from the virtual edge, its deviation from
+    /// its own face; `None` without a depth, beyond the flank's reach, or inside the edge break.
+    pub at_depth: [Option<DepthPoint>; 2],
+}
+
+/// Another point that stands for the edge at a station, beside the virtual edge.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct EdgePoint {
+    /// Where it lies, mm, part frame.
+    pub point: DVec3,
+    /// Its d1, d2, mm, and their standard uncertainties.
+    pub d_mm: [Quantified; 2],
+}
+
+/// A place on a flank at a stated depth.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DepthPoint {
+    /// Where it lies, mm, part frame.
+    pub point: DVec3,
+    /// Deviation from its face along the face's normal at the edge, mm.
+    pub d_mm: Quantified,
 }
 
 /// A value with its standard uncertainty, both in the unit of the field's name.

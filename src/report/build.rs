@@ -9,6 +9,7 @@ use super::Facts;
 use super::characteristic::{on_the_wire, spread};
 use super::conclusion;
 use super::wire::{self, Quantity, Report, Status};
+use crate::inspect::flank::FlankModel;
 use crate::inspect::recipe::{Recipe, Rule};
 use crate::inspect::result::{
     Alignment, BreakShape, Budget, CornerResult, EdgeBreak, EdgeForm, EdgeResult, GapResult,
@@ -418,6 +419,10 @@ fn station_from_result(
         u_d2_mm: None,
         included_angle_deg: None,
         u_included_angle_deg: None,
+        total_mm: None,
+        flank_models: None,
+        ridge: None,
+        at_depth: [None; 2],
         residual_1_mm: None,
         residual_2_mm: None,
         budget: None,
@@ -457,6 +462,25 @@ fn fill_measured(station: &mut wire::Station, measured: &Measured) {
     [station.u_d1_mm, station.u_d2_mm] = measured.u_d_mm.map(finite);
     station.included_angle_deg = degrees(measured.included_angle_rad);
     station.u_included_angle_deg = degrees(measured.u_included_angle_rad);
+    station.total_mm = Some(value(measured.total_mm));
+    station.flank_models = Some(measured.flank_model.map(|model| match model {
+        FlankModel::Displaced => wire::FlankModel::Displaced,
+        FlankModel::Bent => wire::FlankModel::Bent,
+    }));
+    station.ridge = measured.ridge.and_then(|ridge| {
+        Some(wire::EdgePoint {
+            point: xyz(ridge.point)?,
+            d1_mm: value(ridge.d_mm[0]),
+            d2_mm: value(ridge.d_mm[1]),
+        })
+    });
+    station.at_depth = measured.at_depth.map(|place| {
+        let place = place?;
+        Some(wire::DepthPoint {
+            point: xyz(place.point)?,
+            d_mm: value(place.d_mm),
+        })
+    });
     [station.residual_1_mm, station.residual_2_mm] = measured.residual_mm.map(finite);
     let without = [
         (station.u_d1_mm, "uncertainty of d1"),

@@ -28,6 +28,10 @@ pub fn sample(station: &Station, quantity: Quantity) -> Option<Sample> {
                 .map(|angle| angle - station.nominal_included_angle_deg),
             station.u_included_angle_deg,
         ),
+        Quantity::Total => match station.total_mm {
+            Some(total) => (total.value, total.u),
+            None => (None, None),
+        },
         _ => (None, None),
     };
     value.map(|value| Sample { value, u })

@@ -269,6 +269,14 @@ pub struct Station {
     pub included_angle_deg: Option<f64>,
     /// Its standard uncertainty.
     pub u_included_angle_deg: Option<f64>,
+    /// Distance of the measured edge from the nominal one across the tangent, and its standard uncertainty.
+    pub total_mm: Option<Value>,
+    /// What the deviation of each flank was modelled by.
+    pub flank_models: Option<[FlankModel; 2]>,
+    /// The highest place of the real profile along the bisector; null where the edge itself was not seen.
+    pub ridge: Option<EdgePoint>,
+    /// On each flank the place at the depth that the recipe asks for; null without one or where it was not seen.
+    pub at_depth: [Option<DepthPoint>; 2],
     /// Residual standard deviation of the fit to the first flank.
     pub residual_1_mm: Option<f64>,
     /// Residual standard deviation of the fit to the second flank.
@@ -328,6 +336,36 @@ pub struct Spread {
     pub percentile_97_5: Option<f64>,
     /// Share of the values outside the limits, 0 to 1; null without limits.
     pub outside_share: Option<f64>,
+}
+
+/// What the deviation of a flank from its nominal face is modelled by, chosen from the data.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FlankModel {
+    /// The nominal face displaced: offset, tilt across and slope along the edge.
+    Displaced,
+    /// A bend across the edge as well.
+    Bent,
+}
+
+/// Another point that stands for the edge at a station.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct EdgePoint {
+    /// Where it lies.
+    pub point: Xyz,
+    /// Its d1.
+    pub d1_mm: Value,
+    /// Its d2.
+    pub d2_mm: Value,
+}
+
+/// A place on a flank at a stated depth.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct DepthPoint {
+    /// Where it lies.
+    pub point: Xyz,
+    /// Its deviation along the normal of its face.
+    pub d_mm: Value,
 }
 
 /// What a standard uncertainty is made of, in the unit of its value; the parts add in squares.

@@ -5,10 +5,11 @@ use std::time::{Duration, UNIX_EPOCH};
 
 use acies::geometry::RigidTransform;
 use acies::inspect::characteristic::{EdgeValues, characteristics};
+use acies::inspect::flank::FlankModel;
 use acies::inspect::quantity::Quantity;
 use acies::inspect::recipe::{Limits, Recipe, Rule};
 use acies::inspect::result::{
-    Alignment, Budget, EdgeResult, Inspection, Measured, StationResult, Verdict,
+    Alignment, Budget, EdgeResult, Inspection, Measured, Quantified, StationResult, Verdict,
 };
 use acies::nominal::{EdgeKind, Station};
 use acies::report::{DeviceFacts, Facts, ScanFacts};
@@ -174,6 +175,14 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
                 points: 0.0015,
                 ..Budget::default()
             },
+            covariance_d_mm2: 0.0,
+            total_mm: Quantified {
+                value: (d_mm[0] * normals[0] + d_mm[1] * normals[1]).length(),
+                u: u_mm[0],
+            },
+            flank_model: [FlankModel::Displaced; 2],
+            ridge: None,
+            at_depth: [None; 2],
         }),
         points: [184, 172],
         verdict,

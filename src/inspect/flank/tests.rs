@@ -61,6 +61,7 @@ const SETTINGS: FlankSettings = FlankSettings {
     cut_mm: 0.1,
     spacing_mm: 0.05,
     min_points: 12,
+    keep_designs: false,
 };
 
 /// (rms of z, share of |z| < 2, mean offset uncertainty, mean points) over 20 seeds of 20 stations.

@@ -35,25 +35,75 @@ pub(super) fn find_cuts<const P: usize>(
     settings: &FlankSettings,
 ) -> Vec<Option<Cut>> {
     let blocks = windows.count.div_ceil(BLOCK);
-    let found: Vec<Option<Cut>> = (0..blocks)
+    let walks: Vec<Walk> = (0..blocks)
         .map(|b| {
             let stations = b * BLOCK..((b + 1) * BLOCK).min(windows.count);
             walk::<P>(points, windows, settings, stations)
         })
         .collect();
+    let common = common_cut(&walks).min(0.6 * settings.reach_mm);
     (0..windows.count)
         .map(|k| {
             let block = k / BLOCK;
             // A transition that widens along the edge shows in the neighbouring block first.
-            let near = &found[block.saturating_sub(1)..(block + 2).min(blocks)];
-            let own = found[block]?;
-            let widest = near.iter().flatten().map(|c| c.cut_mm).fold(0.0, f64::max);
+            let near = &walks[block.saturating_sub(1)..(block + 2).min(blocks)];
+            let own = walks[block].cut?;
+            let widest = near
+                .iter()
+                .filter_map(|w| w.cut)
+                .map(|c| c.cut_mm)
+                .fold(0.0, f64::max);
             Some(Cut {
-                cut_mm: own.cut_mm.max(widest.min(2.0 * own.cut_mm)),
+                cut_mm: own.cut_mm.max(widest.min(2.0 * own.cut_mm)).max(common),
                 ..own
             })
         })
         .collect()
+}
+
+/// What one block's way inwards showed.
+#[derive(Debug, Clone, Default)]
+struct Walk {
+    cut: Option<Cut>,
+    /// Every bin on the way, from outside to inside. The places are the same for all blocks.
+    seen: Vec<SeenBin>,
+}
+
+/// A bin on the way.
+#[derive(Debug, Clone, Copy)]
+struct SeenBin {
+    /// Its outer end, mm.
+    outer: f64,
+    /// Its mean over its standard uncertainty.
+    z: f64,
+    /// That uncertainty, mm.
+    u: f64,
+}
+
+/// The cut that the blocks of an edge show together: the smear of a spot is the same all along, and too small to be seen in one block
+/// alone. No block counts for more than it would have to be left out itself. 0 where nothing shows.
+fn common_cut(walks: &[Walk]) -> f64 {
+    let longest = walks.iter().map(|w| w.seen.len()).max().unwrap_or(0);
+    for k in 0..longest {
+        let bins: Vec<&SeenBin> = walks
+            .iter()
+            .filter_map(|w| w.seen.get(k))
+            .filter(|b| b.u > 0.0)
+            .collect();
+        let n = bins.len() as f64;
+        let sum: f64 = bins.iter().map(|b| b.z.clamp(-LEFT, LEFT)).sum();
+        if n >= 3.0 && sum.abs() > LEFT * n.sqrt() {
+            let u = bins.iter().map(|b| b.u).sum::<f64>() / n;
+            let hidden = LEFT * u / n.sqrt();
+            return detachment(bins[0].outer, hidden);
+        }
+    }
+    0.0
+}
+
+/// Where a rounded edge detaches whose departure reaches `hidden` at distance `first`, mm.
+fn detachment(first: f64, hidden: f64) -> f64 {
+    first + hidden + (hidden * hidden + 2.0 * first * hidden).sqrt()
 }
 
 fn walk<const P: usize>(
@@ -61,9 +111,10 @@ fn walk<const P: usize>(
     windows: &Windows,
     settings: &FlankSettings,
     stations: std::ops::Range<usize>,
-) -> Option<Cut> {
+) -> Walk {
     let mut cut = 0.5 * settings.reach_mm;
-    let mut seen = false;
+    let mut any = false;
+    let mut way = Walk::default();
     while cut > settings.cut_mm {
         let inner = (0.5 * cut).max(settings.cut_mm);
         let count = (((cut - inner) / settings.spacing_mm) as usize).clamp(1, BINS);
@@ -76,27 +127,29 @@ fn walk<const P: usize>(
         };
         let fits: Vec<(usize, WindowFit<P>)> = stations
             .clone()
-            .filter_map(|k| Some((k, fit_window(points, &range(k), settings.min_points).ok()?)))
+            .filter_map(|k| Some((k, fit_window(points, &range(k), settings).ok()?)))
             .collect();
-        seen |= !fits.is_empty();
+        any |= !fits.is_empty();
         let noise = variance::pooled(fits.iter().map(|f| &f.1));
         for (k, window) in &fits {
             bins.take_in(points, &range(*k), window, &noise);
         }
+        bins.note(&mut way.seen);
         if let Some((bin, hidden)) = bins.outermost_left() {
-            let first = bins.outer_end(bin);
-            let detached = first + hidden + (hidden * hidden + 2.0 * first * hidden).sqrt();
-            return Some(Cut {
+            let detached = detachment(bins.outer_end(bin), hidden);
+            way.cut = Some(Cut {
                 cut_mm: detached.min(0.6 * settings.reach_mm),
                 too_wide: detached > 0.5 * settings.reach_mm,
             });
+            return way;
         }
         cut = inner;
     }
-    seen.then_some(Cut {
+    way.cut = any.then_some(Cut {
         cut_mm: settings.cut_mm,
         too_wide: false,
-    })
+    });
+    way
 }
 
 /// Mean residual of one bin over a block: sum, its variance, points.
@@ -157,6 +210,19 @@ impl Bins {
             bin.sum += sum;
             bin.count += n;
             bin.variance += noise.of_sum(n, &rows, window);
+        }
+    }
+
+    /// Adds all bins to `seen`, from outside to inside.
+    fn note(&self, seen: &mut Vec<SeenBin>) {
+        for (k, bin) in self.bins.iter().enumerate().rev() {
+            let spread = bin.variance.sqrt();
+            let known = bin.count > 0.0 && spread > 0.0;
+            seen.push(SeenBin {
+                outer: self.outer_end(k),
+                z: if known { bin.sum / spread } else { 0.0 },
+                u: if known { spread / bin.count } else { 0.0 },
+            });
         }
     }
 

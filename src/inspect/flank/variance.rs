@@ -6,8 +6,8 @@
 
 use std::collections::BTreeMap;
 
-use super::{Series, WindowFit};
-use crate::inspect::clusters::{Clusters, SIGNIFICANT, product};
+use super::{Design, Series, WindowFit};
+use crate::inspect::clusters::{Clusters, NO_GROUP, SIGNIFICANT, product};
 
 /// Weight of the neighbouring stations' noise against the station's own, in degrees of freedom.
 const PRIOR_FREEDOM: f64 = 30.0;
@@ -27,6 +27,39 @@ impl Noise {
     pub(super) fn covariance<const P: usize>(&self, window: &WindowFit<P>) -> [[f64; 2]; 2] {
         let full = self.full(window);
         [[full[0][0], full[0][1]], [full[1][0], full[1][1]]]
+    }
+
+    /// The fit's map from points to (offset, tilt), with the noise that [`Self::covariance`] holds, `form` times its variance.
+    pub(super) fn design<const P: usize>(&self, window: &WindowFit<P>, form: f64) -> Design {
+        let unit = |i: usize| std::array::from_fn(|k| if k == i { 1.0 } else { 0.0 });
+        let of = |row: &[f64; P]| [0, 1].map(|i| product(&unit(i), &window.fit.cofactor, row));
+        let shared = |component: f64, clusters: &Clusters<P>| {
+            component
+                * product(
+                    &window.fit.cofactor[0],
+                    &clusters.scatter,
+                    &window.fit.cofactor[0],
+                )
+        };
+        let by_line = shared(self.line, &window.lines) >= shared(self.cell, &window.cells);
+        let component = if by_line { self.line } else { self.cell };
+        let mut groups: BTreeMap<u32, [f64; 2]> = BTreeMap::new();
+        let mut influence = Vec::with_capacity(window.used.len());
+        for (row, line, cell) in &window.used {
+            let own = of(row);
+            influence.push(own);
+            let group = if by_line { *line } else { *cell };
+            if component > 0.0 && group != NO_GROUP {
+                let sum = groups.entry(group).or_insert([0.0; 2]);
+                sum[0] += own[0];
+                sum[1] += own[1];
+            }
+        }
+        Design {
+            influence,
+            groups: groups.into_iter().collect(),
+            sigma_mm: [self.white, component].map(|v| (v * form).sqrt()),
+        }
     }
 
     /// Covariance of all coefficients. Lines and cells overlap, so the larger of the two counts, not their sum.

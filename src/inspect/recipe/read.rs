@@ -69,6 +69,8 @@ fn recipe(keys: &mut Keys) -> Recipe {
             .unwrap_or(default.unexpected_edges_count),
         station_step_mm: keys.number("station_step_mm", 1e-3..=1e4),
         flank_mm: keys.number("flank_mm", 1e-3..=1e4),
+        depth_mm: keys.number("depth_mm", 0.0..=1e4),
+        held: held(keys).unwrap_or_default(),
         direction_mm: keys.number("direction_mm", 1e-3..=1e4),
         u_calibration_mm: keys
             .number("u_calibration_mm", 0.0..=10.0)
@@ -88,6 +90,21 @@ fn inner(keys: &mut Keys, key: &'static str, mut read: impl FnMut(&mut Keys)) {
         read(&mut inner);
         keys.adopt(key, inner);
     }
+}
+
+fn held(keys: &mut Keys) -> Option<[bool; 6]> {
+    const NAMES: [&str; 6] = [
+        "turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z",
+    ];
+    let expected = format!("names among {}", NAMES.join(", "));
+    keys.read("hold", &expected, |value| {
+        let mut held = [false; 6];
+        for name in value.as_array()? {
+            let place = NAMES.iter().position(|n| Some(*n) == name.as_str())?;
+            held[place] = true;
+        }
+        Some(held)
+    })
 }
 
 fn read_expansion(keys: &mut Keys) -> Option<Expansion> {

@@ -1,0 +1,333 @@
+//! Propagation of distributions by the Monte Carlo method: the check on the first-order uncertainties.
+//!
+//! Every trial redraws all inputs - each point's noise about its fitted flank, the noise that scan lines or form share, the pose, the
+//! calibration, the part's temperature and expansion - and runs the measurement on them: the flank fits, the exact intersection with the
+//! curved faces, the exact motion and growth. Trials are drawn in blocks until the results stand still.
+//!
+//! Source: JCGM 101:2008, 5.9 and 7.9 (adaptive procedure). We differ: which points a flank uses is kept from the measurement.
+
+use glam::{DQuat, DVec3};
+use nalgebra::{Matrix6, SymmetricEigen};
+use rayon::prelude::*;
+
+use super::assign::{Place, Surface};
+use super::body::Body;
+use super::flank::{Design, FlankFit};
+use super::measure::{EdgeContext, Flanks, MeasureSettings, with_flanks};
+use crate::nominal::Station;
+use crate::points::PointCloud;
+
+/// How many trials, and from which numbers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MonteCarlo {
+    /// Seed of all draws; the same seed gives the same bits for any number of threads.
+    pub seed: u64,
+    /// Trials of a block; JCGM 101 asks for at least 10,000.
+    pub block: usize,
+    /// Blocks after which it ends, stable or not.
+    pub blocks_max: usize,
+    /// Significant digits of the standard uncertainty that must stand (JCGM 101, 7.9.2): 1 or 2.
+    pub digits: u32,
+    /// Probability of the interval.
+    pub probability: f64,
+}
+
+impl Default for MonteCarlo {
+    fn default() -> Self {
+        Self {
+            seed: 1,
+            block: 10_000,
+            blocks_max: 20,
+            digits: 2,
+            probability: 0.95,
+        }
+    }
+}
+
+/// A value as its trials show it, in the unit of the field that holds it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Drawn {
+    /// Mean of the trials.
+    pub mean: f64,
+    /// Their standard deviation.
+    pub u: f64,
+    /// Probabilistically symmetric interval of the probability asked for.
+    pub interval: [f64; 2],
+}
+
+/// One station.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DrawnStation {
+    /// d1, d2, mm.
+    pub d_mm: [Drawn; 2],
+    /// Included angle, rad.
+    pub included_angle_rad: Drawn,
+    /// Trials drawn.
+    pub trials: usize,
+    /// Whether the values stand still to the digits asked for.
+    pub stable: bool,
+}
+
+/// The stations of every edge, as [`super::measure::measure_edges`] gives them; `None` where a station was not measured.
+pub fn measure_monte_carlo<B: Body>(
+    cloud: &PointCloud,
+    places: &[Place],
+    surface: &Surface<'_, B>,
+    settings: &MeasureSettings,
+    how: &MonteCarlo,
+) -> Vec<Vec<Option<DrawnStation>>> {
+    let pose = root(&settings.pose_covariance);
+    with_flanks(cloud, places, surface, (settings, &[]), true, |flanks| {
+        let draw = |e: usize, k: usize| station(flanks, settings, &pose, how, (e, k));
+        (0..flanks.series.len())
+            .map(|e| {
+                (0..flanks.windows[e].count)
+                    .into_par_iter()
+                    .map(|k| draw(e, k))
+                    .collect()
+            })
+            .collect()
+    })
+}
+
+/// The symmetric square root of a covariance.
+fn root(covariance: &[[f64; 6]; 6]) -> [[f64; 6]; 6] {
+    let matrix = Matrix6::from_fn(|i, j| 0.5 * (covariance[i][j] + covariance[j][i]));
+    let eigen = SymmetricEigen::new(matrix);
+    let scaled = Matrix6::from_diagonal(&eigen.eigenvalues.map(|v| v.max(0.0).sqrt()));
+    let root = eigen.eigenvectors * scaled * eigen.eigenvectors.transpose();
+    std::array::from_fn(|i| std::array::from_fn(|j| root[(i, j)]))
+}
+
+fn station<B: Body>(
+    flanks: &Flanks<'_, B>,
+    settings: &MeasureSettings,
+    pose: &[[f64; 6]; 6],
+    how: &MonteCarlo,
+    (e, k): (usize, usize),
+) -> Option<DrawnStation> {
+    let pair = &flanks.series[e];
+    let (Ok(first), Ok(second)) = (&pair[0].stations[k], &pair[1].stations[k]) else {
+        return None;
+    };
+    let context = (flanks.context)(e);
+    let model = Model {
+        station: context.station(&flanks.windows[e], k),
+        context,
+        fits: [first, second],
+        designs: [pair[0].designs.get(k)?, pair[1].designs.get(k)?],
+        settings,
+        pose,
+    };
+    model.trial(&mut Inputs::none())?;
+    let mut trials: [Vec<f64>; 3] = Default::default();
+    let mut blocks: Vec<[Drawn; 3]> = Vec::new();
+    let mut stable = false;
+    let size = how.block.clamp(100, 1_000_000);
+    while blocks.len() < how.blocks_max.clamp(2, 1000) && !stable {
+        let from = blocks.len() * size;
+        for t in from..from + size {
+            let place = ((e as u64) << 32) ^ k as u64;
+            let mut inputs = Inputs {
+                shared: Some(Draws::new(how.seed, t as u64)),
+                own: Some(Draws::new(
+                    how.seed ^ place.wrapping_add(1).wrapping_mul(0x9FB2_1C65_1E98_DF25),
+                    t as u64,
+                )),
+            };
+            // Flanks that a draw makes parallel have no edge; one that was measured is far from it.
+            if let Some(values) = model.trial(&mut inputs) {
+                for (list, value) in trials.iter_mut().zip(values) {
+                    list.push(value);
+                }
+            }
+        }
+        let of = |list: &Vec<f64>| summary(&list[from.min(list.len())..], how.probability);
+        blocks.push([of(&trials[0]), of(&trials[1]), of(&trials[2])]);
+        stable = stands_still(&blocks, how.digits);
+    }
+    let all = trials.each_ref().map(|list| summary(list, how.probability));
+    Some(DrawnStation {
+        d_mm: [all[0], all[1]],
+        included_angle_rad: all[2],
+        trials: trials[0].len(),
+        stable,
+    })
+}
+
+fn summary(values: &[f64], probability: f64) -> Drawn {
+    let n = values.len().max(1) as f64;
+    let mean = values.iter().sum::<f64>() / n;
+    let square = values.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
+    let mut sorted = values.to_vec();
+    sorted.sort_unstable_by(f64::total_cmp);
+    let tail = 0.5 * (1.0 - probability);
+    let at = |share: f64| {
+        let index = (share * n).round() as usize;
+        sorted
+            .get(index.min(sorted.len().saturating_sub(1)))
+            .copied()
+            .unwrap_or(mean)
+    };
+    Drawn {
+        mean,
+        u: (square / (n - 1.0).max(1.0)).sqrt(),
+        interval: [at(tail), at(1.0 - tail)],
+    }
+}
+
+/// JCGM 101, 7.9.4: twice the standard deviation of the mean of every result over the blocks is below half a unit of the last digit.
+fn stands_still(blocks: &[[Drawn; 3]], digits: u32) -> bool {
+    let h = blocks.len() as f64;
+    if h < 2.0 {
+        return false;
+    }
+    (0..3).all(|v| {
+        let of = |pick: fn(&Drawn) -> f64| {
+            let mean = blocks.iter().map(|b| pick(&b[v])).sum::<f64>() / h;
+            let square = blocks
+                .iter()
+                .map(|b| (pick(&b[v]) - mean).powi(2))
+                .sum::<f64>();
+            (mean, (square / (h * (h - 1.0))).sqrt())
+        };
+        let (u, s_u) = of(|d| d.u);
+        let tolerance =
+            0.5 * 10f64.powf(u.max(1e-300).log10().floor() - f64::from(digits.clamp(1, 3) - 1));
+        [
+            s_u,
+            of(|d| d.mean).1,
+            of(|d| d.interval[0]).1,
+            of(|d| d.interval[1]).1,
+        ]
+        .iter()
+        .all(|s| 2.0 * s < tolerance)
+    })
+}
+
+/// The measurement of one station as a function of its inputs.
+struct Model<'a, B: Body> {
+    context: EdgeContext<'a, B>,
+    station: Station,
+    fits: [&'a FlankFit; 2],
+    designs: [&'a Design; 2],
+    settings: &'a MeasureSettings,
+    pose: &'a [[f64; 6]; 6],
+}
+
+/// What a trial draws from: the inputs that all stations share, and the station's own.
+struct Inputs {
+    shared: Option<Draws>,
+    own: Option<Draws>,
+}
+
+impl Inputs {
+    /// Every input at its estimate.
+    fn none() -> Self {
+        Self {
+            shared: None,
+            own: None,
+        }
+    }
+
+    fn shared(&mut self) -> f64 {
+        self.shared.as_mut().map_or(0.0, Draws::normal)
+    }
+}
+
+impl<B: Body> Model<'_, B> {
+    /// d1, d2 and the included angle.
+    fn trial(&self, inputs: &mut Inputs) -> Option<[f64; 3]> {
+        let drawn: [FlankFit; 2] = std::array::from_fn(|i| {
+            let [offset, tilt] = inputs
+                .own
+                .as_mut()
+                .map_or([0.0; 2], |own| redraw(self.designs[i], own));
+            FlankFit {
+                offset_mm: self.fits[i].offset_mm + offset,
+                tilt: self.fits[i].tilt + tilt,
+                ..*self.fits[i]
+            }
+        });
+        let edge = self
+            .context
+            .virtual_edge(&self.station, [&drawn[0], &drawn[1]])?;
+        let unit: [f64; 6] = std::array::from_fn(|_| inputs.shared());
+        let motion: [f64; 6] =
+            std::array::from_fn(|i| (0..6).map(|j| self.pose[i][j] * unit[j]).sum());
+        let turn = DQuat::from_scaled_axis(DVec3::new(motion[0], motion[1], motion[2]));
+        let mut p = turn * edge.point + DVec3::new(motion[3], motion[4], motion[5]);
+        if let Some(expansion) = &self.settings.expansion {
+            let mut drawn = *expansion;
+            drawn.coefficient_per_k += expansion.u_coefficient_per_k * inputs.shared();
+            drawn.temperature_c += expansion.u_temperature_k * inputs.shared();
+            let centre = self.context.shared.centre;
+            p = centre + (p - centre) / (1.0 + drawn.strain());
+        }
+        let d = [0, 1].map(|i| {
+            (p - self.station.point).dot(self.station.normals[i])
+                + self.settings.u_calibration_mm * inputs.shared()
+        });
+        let angle = edge.included_angle_rad + self.settings.u_calibration_rad * inputs.shared();
+        Some([d[0], d[1], angle])
+    }
+}
+
+/// What new noise on all points of a fit adds to (offset, tilt).
+fn redraw(design: &Design, draws: &mut Draws) -> [f64; 2] {
+    let mut sum = [0.0; 2];
+    let mut add = |influence: &[f64; 2], sigma: f64| {
+        let noise = sigma * draws.normal();
+        sum[0] += influence[0] * noise;
+        sum[1] += influence[1] * noise;
+    };
+    for influence in &design.influence {
+        add(influence, design.sigma_mm[0]);
+    }
+    for (_, influence) in &design.groups {
+        add(influence, design.sigma_mm[1]);
+    }
+    sum
+}
+
+/// Normal numbers from a counter: SplitMix64 and the polar form of Box and Muller.
+struct Draws {
+    state: u64,
+    spare: Option<f64>,
+}
+
+impl Draws {
+    fn new(seed: u64, trial: u64) -> Self {
+        let mut draws = Self {
+            state: seed ^ trial.wrapping_mul(0xD6E8_FEB8_6659_FD93),
+            spare: None,
+        };
+        // Neighbouring seeds start apart.
+        draws.state = draws.bits();
+        draws
+    }
+
+    fn bits(&mut self) -> u64 {
+        self.state = self.state.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.state;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^ (z >> 31)
+    }
+
+    fn normal(&mut self) -> f64 {
+        if let Some(spare) = self.spare.take() {
+            return spare;
+        }
+        loop {
+            let [x, y] =
+                [0; 2].map(|_| (self.bits() >> 11) as f64 * (2.0 / (1u64 << 53) as f64) - 1.0);
+            let square = x * x + y * y;
+            if square > 0.0 && square < 1.0 {
+                let scale = (-2.0 * square.ln() / square).sqrt();
+                self.spare = Some(y * scale);
+                return x * scale;
+            }
+        }
+    }
+}
