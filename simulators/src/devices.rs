@@ -2,16 +2,23 @@
 
 use std::io;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use crate::demo_cell::{DemoCell, DemoOptions};
+use crate::demo_cell::{DemoCell, DemoOptions, TIP_RADIUS_MM};
 use crate::faults::{FaultError, Faults};
 use crate::gauge::{self, Dialect};
+use crate::gocator::{self, SimulatedGocator};
 use crate::grbl::SimulatedProbe;
+use crate::ippdme::{self, SimulatedCmm};
 use crate::open_profile::SimulatedProfiler;
 use crate::optoncdt;
 use crate::point::SimulatedSensor;
 use crate::rf60x;
+use crate::u3v;
+use crate::usb::Socket;
+use crate::usb::preload::Carrier;
+use crate::usb_itn::InputTool;
 use crate::wire::Wire;
 
 /// A kind of device that can be started.
@@ -24,7 +31,7 @@ pub struct Kind {
 }
 
 /// Every kind.
-pub const ALL: [Kind; 9] = [
+pub const ALL: [Kind; 13] = [
     Kind {
         name: "open-profile",
         summary: "line-laser profiler of the open-profile protocol, looking from the left",
@@ -61,6 +68,22 @@ pub const ALL: [Kind; 9] = [
         name: "keyence",
         summary: "two laser distance sensors Keyence IL on a DL-RS1A",
     },
+    Kind {
+        name: "gocator",
+        summary: "LMI Gocator looking from the left; data 6 and health 4 ports above the control port",
+    },
+    Kind {
+        name: "ippdme",
+        summary: "measuring machine with an I++ DME server",
+    },
+    Kind {
+        name: "u3v-profiler",
+        summary: "USB3 Vision line profiler looking from the left",
+    },
+    Kind {
+        name: "usb-itn",
+        summary: "Mitutoyo gauge on a USB-ITN",
+    },
 ];
 
 /// Where a device is to appear.
@@ -70,6 +93,8 @@ pub enum Place {
     Pty(PathBuf),
     /// A listening socket; port 0 takes any that is free.
     Tcp(SocketAddr),
+    /// A folder in which umockdev's preload library finds a USB device; see [`crate::usb::preload`].
+    Usb(PathBuf),
 }
 
 /// A device that runs; dropping it takes its port away.
@@ -81,15 +106,31 @@ pub enum Simulated {
     Probe(SimulatedProbe),
     /// A sensor of single points, or several of them.
     Sensor(SimulatedSensor),
+    /// A Gocator, and where its control channel listens.
+    Gocator(SimulatedGocator, String),
+    /// A measuring machine, and where it listens.
+    Cmm(SimulatedCmm, String),
+    /// A USB device, and what to start a program with that is to see it.
+    Usb(Usb, String),
+}
+
+/// A USB device in a folder.
+#[derive(Debug)]
+pub enum Usb {
+    /// A line profiler.
+    U3v(Carrier<u3v::Profiler>),
+    /// A gauge.
+    Itn(Carrier<InputTool>),
 }
 
 impl Simulated {
-    /// Where a host finds it: the path of the port, or `address:port`.
+    /// Where a host finds it: the path of the port, `address:port`, or the variables that show a USB device to a program.
     pub fn port(&self) -> &str {
         match self {
             Simulated::Profiler(profiler) => profiler.port(),
             Simulated::Probe(probe) => probe.port(),
             Simulated::Sensor(sensor) => sensor.port(),
+            Simulated::Gocator(_, port) | Simulated::Cmm(_, port) | Simulated::Usb(_, port) => port,
         }
     }
 }
@@ -106,6 +147,16 @@ pub enum StartError {
     /// Faults that cannot be read.
     #[error(transparent)]
     Faults(#[from] FaultError),
+    /// A place where no such device can be, or faults that it has not.
+    #[error("simulator: {name} {found}, expected {expected}")]
+    Place {
+        /// Which device.
+        name: String,
+        /// What was asked for.
+        found: &'static str,
+        /// What is possible.
+        expected: &'static str,
+    },
     /// The system refuses the port.
     #[error("{port}: {source}, expected a path or address that can be taken; choose another")]
     Port {
@@ -132,14 +183,70 @@ pub fn start(name: &str, place: &Place, seed: u64, faults: &str) -> Result<Simul
     if !ALL.iter().any(|kind| kind.name == name) {
         return Err(StartError::UnknownDevice { name: name.into() });
     }
-    let wire = match place {
-        Place::Pty(path) => Wire::pty(path),
-        Place::Tcp(address) => Wire::tcp(*address),
-    };
     let port = match place {
-        Place::Pty(path) => path.display().to_string(),
+        Place::Pty(path) | Place::Usb(path) => path.display().to_string(),
         Place::Tcp(address) => address.to_string(),
     };
+    let started = match (name, place) {
+        ("gocator" | "ippdme" | "u3v-profiler" | "usb-itn", _)
+            if !faults_text(&cell).is_empty() =>
+        {
+            return Err(refused(
+                name,
+                "with faults",
+                "none: its faults are for tests",
+            ));
+        }
+        ("gocator", Place::Tcp(address)) => start_gocator(&cell, *address),
+        ("ippdme", Place::Tcp(address)) => start_cmm(&cell, *address),
+        ("gocator" | "ippdme", _) => {
+            return Err(refused(
+                name,
+                "somewhere else",
+                "an address for it to listen on",
+            ));
+        }
+        ("u3v-profiler" | "usb-itn", Place::Usb(folder)) => start_usb(&cell, name, folder),
+        ("u3v-profiler" | "usb-itn", _) => {
+            return Err(refused(
+                name,
+                "somewhere else",
+                "a folder for the USB device",
+            ));
+        }
+        (_, Place::Usb(_)) => {
+            return Err(refused(name, "on USB", "a pseudo-terminal or an address"));
+        }
+        (_, Place::Pty(path)) => Wire::pty(path).and_then(|wire| start_on_wire(&cell, name, wire, (seed, &of_sensor))),
+        (_, Place::Tcp(address)) => {
+            Wire::tcp(*address).and_then(|wire| start_on_wire(&cell, name, wire, (seed, &of_sensor)))
+        }
+    };
+    started.map_err(|source| StartError::Port { port, source })
+}
+
+fn refused(name: &str, found: &'static str, expected: &'static str) -> StartError {
+    StartError::Place {
+        name: name.to_owned(),
+        found,
+        expected,
+    }
+}
+
+/// Something where the cell has faults.
+fn faults_text(cell: &DemoCell) -> &'static str {
+    match cell.options.faults == Faults::default() {
+        true => "",
+        false => "faults",
+    }
+}
+
+fn start_on_wire(
+    cell: &DemoCell,
+    name: &str,
+    wire: Wire,
+    (seed, of_sensor): (u64, &Faults),
+) -> io::Result<Simulated> {
     let gauge = |dialect, channels, wire| {
         let setup = gauge::Setup {
             channels,
@@ -148,15 +255,15 @@ pub fn start(name: &str, place: &Place, seed: u64, faults: &str) -> Result<Simul
         };
         gauge::start(wire, setup).map(Simulated::Sensor)
     };
-    let started = wire.and_then(|wire| match name {
+    match name {
         "optoncdt" => {
             let mut setup = optoncdt::Setup::new("SIM-1420", seed);
-            setup.faults.clone_from(&of_sensor);
+            setup.faults.clone_from(of_sensor);
             optoncdt::start(wire, setup).map(Simulated::Sensor)
         }
         "rf60x" => {
             let mut setup = rf60x::Setup::new(&[17_185, 17_186], seed);
-            setup.faults.clone_from(&of_sensor);
+            setup.faults.clone_from(of_sensor);
             rf60x::start(wire, setup).map(Simulated::Sensor)
         }
         "heidenhain-nd" => gauge(Dialect::HeidenhainNd, 1, wire),
@@ -166,8 +273,60 @@ pub fn start(name: &str, place: &Place, seed: u64, faults: &str) -> Result<Simul
         "grbl-probe" => cell.start_probe(wire).map(Simulated::Probe),
         "open-profile-right" => cell.start_profiler(1, wire).map(Simulated::Profiler),
         _ => cell.start_profiler(0, wire).map(Simulated::Profiler),
+    }
+}
+
+/// Lines a second of devices that people watch.
+const RATE_HZ: f64 = 500.0;
+
+fn start_gocator(cell: &DemoCell, address: SocketAddr) -> io::Result<Simulated> {
+    let view = cell.sensors[0].view.clone();
+    let setup = gocator::Setup {
+        rate_hz: Some(RATE_HZ),
+        frames: view.traverse.profiles.into(),
+        ..gocator::Setup::new(13_434, gocator::Surface::View(Box::new(view)))
+    };
+    // Control 3190, data 3196, health 3194 on a real one.
+    let ports = [0, 6, 4].map(|above| match address.port() {
+        0 => address,
+        port => SocketAddr::new(address.ip(), port.saturating_add(above)),
     });
-    started.map_err(|source| StartError::Port { port, source })
+    let device = SimulatedGocator::start_on(ports, setup)?;
+    let port = device.address().to_string();
+    Ok(Simulated::Gocator(device, port))
+}
+
+fn start_cmm(cell: &DemoCell, address: SocketAddr) -> io::Result<Simulated> {
+    let setup = ippdme::Setup::new(
+        Arc::clone(&cell.part.made),
+        cell.machine_from_part,
+        TIP_RADIUS_MM,
+    );
+    let device = SimulatedCmm::start_on(address, setup)?;
+    let port = device.address().to_string();
+    Ok(Simulated::Cmm(device, port))
+}
+
+fn start_usb(cell: &DemoCell, name: &str, folder: &Path) -> io::Result<Simulated> {
+    let shown = |variables: [(&str, String); 2]| {
+        let pairs = variables.map(|(name, value)| format!("{name}={value}"));
+        pairs.join(" ")
+    };
+    if name == "usb-itn" {
+        let tool = InputTool::new("70412345", vec![-1234, -1230, -1229, -1233]);
+        let carrier = Carrier::start(folder, Socket::new(tool))?;
+        let port = shown(carrier.environment());
+        return Ok(Simulated::Usb(Usb::Itn(carrier), port));
+    }
+    let view = cell.sensors[0].view.clone();
+    let setup = u3v::Setup {
+        rate_hz: Some(RATE_HZ),
+        blocks: view.traverse.profiles.into(),
+        ..u3v::Setup::new("SN-0042", u3v::Surface::View(Box::new(view)))
+    };
+    let carrier = Carrier::start(folder, Socket::new(u3v::Profiler::new(setup)))?;
+    let port = shown(carrier.environment());
+    Ok(Simulated::Usb(Usb::U3v(carrier), port))
 }
 
 #[cfg(test)]
@@ -181,7 +340,7 @@ mod tests {
         assert_eq!(
             unknown,
             "simulator: no device is called \"toaster\", expected one of open-profile, open-profile-right, grbl-probe, \
-             optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac, keyence"
+             optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac, keyence, gocator, ippdme, u3v-profiler, usb-itn"
         );
         let fault = start("grbl-probe", &tcp, 1, "drop=x")
             .unwrap_err()
@@ -203,9 +362,24 @@ mod tests {
     #[test]
     fn each_kind_starts() {
         let tcp = Place::Tcp(SocketAddr::from(([127, 0, 0, 1], 0)));
+        let folder = std::env::temp_dir().join(format!("acies-sim-{}", std::process::id()));
         for kind in ALL {
-            let device = start(kind.name, &tcp, 1, "").unwrap();
-            assert!(device.port().starts_with("127.0.0.1:"));
+            let usb = ["u3v-profiler", "usb-itn"].contains(&kind.name);
+            if usb {
+                let folder = folder.join(kind.name);
+                std::fs::create_dir_all(&folder).unwrap();
+                let device = start(kind.name, &Place::Usb(folder), 1, "").unwrap();
+                assert!(device.port().starts_with("LD_PRELOAD="));
+                let error = start(kind.name, &tcp, 1, "").unwrap_err().to_string();
+                assert!(
+                    error.ends_with("expected a folder for the USB device"),
+                    "{error}"
+                );
+            } else {
+                let device = start(kind.name, &tcp, 1, "").unwrap();
+                assert!(device.port().starts_with("127.0.0.1:"));
+            }
         }
+        std::fs::remove_dir_all(folder).unwrap();
     }
 }

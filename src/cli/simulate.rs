@@ -14,7 +14,8 @@ use super::{Failure, Status, print_line};
 #[derive(Debug, clap::Args)]
 #[command(after_help = AFTER)]
 pub struct Simulate {
-    /// Which device: open-profile, open-profile-right, grbl-probe, optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac or keyence.
+    /// Which device: open-profile, open-profile-right, grbl-probe, optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac, keyence, gocator,
+    /// ippdme, u3v-profiler or usb-itn.
     device: String,
     /// Path under which the pseudo-terminal appears.
     #[arg(long, value_name = "PATH", conflicts_with = "tcp")]
@@ -22,6 +23,9 @@ pub struct Simulate {
     /// Listen on this address instead, as in 127.0.0.1:7450.
     #[arg(long, value_name = "ADDRESS")]
     tcp: Option<SocketAddr>,
+    /// Make a USB device in this new folder; what is printed goes before the command of the program that is to see it.
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["tcp", "port"])]
+    usb: Option<PathBuf>,
     /// Seed of noise, place and faults.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -47,9 +51,15 @@ impl Simulate {
     /// Wrong usage where device or faults are unknown; input or output where the port cannot be taken.
     pub fn run(self) -> Result<Status, Failure> {
         let default_port = || PathBuf::from(format!("tty-{}", self.device));
-        let place = match self.tcp {
-            Some(address) => Place::Tcp(address),
-            None => Place::Pty(self.port.clone().unwrap_or_else(default_port)),
+        if let Some(folder) = &self.usb {
+            std::fs::create_dir(folder)
+                .with_context(|| format!("{}: cannot be made", folder.display()))
+                .map_err(Failure::Io)?;
+        }
+        let place = match (self.usb.clone(), self.tcp) {
+            (Some(folder), _) => Place::Usb(folder),
+            (_, Some(address)) => Place::Tcp(address),
+            _ => Place::Pty(self.port.clone().unwrap_or_else(default_port)),
         };
         let device = devices::start(&self.device, &place, self.seed, &self.faults);
         let device = device.map_err(|error| match error {

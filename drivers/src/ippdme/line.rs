@@ -116,7 +116,7 @@ fn report(text: &str) -> Option<Report> {
         return None;
     };
     let whole = |number: f64| {
-        let fits = number >= 0.0 && number <= 1e6 && number.fract() == 0.0;
+        let fits = (0.0..=1e6).contains(&number) && number.fract() == 0.0;
         fits.then_some(number as u32)
     };
     Some(Report {

@@ -232,7 +232,7 @@ impl Session {
         let mut points = Vec::new();
         for items in &data {
             let numbers: Vec<f64> = items.iter().filter_map(number).collect();
-            if numbers.len() != items.len() || numbers.len() % 3 != 0 {
+            if numbers.len() != items.len() || !numbers.len().is_multiple_of(3) {
                 return Err(self.decode(DecodeError::Field {
                     message: "ScanOnLine",
                     field: "count of numbers",

@@ -522,10 +522,10 @@ mod tests {
                 if bytes.len() >= 4 {
                     bytes[..4].copy_from_slice(&magic.to_le_bytes());
                 }
-                if let Ok(leader) = leader(&bytes) {
-                    if let Ok(lines) = lines(&bytes, &leader, leader.height, pixel) {
+                if let Ok(leader) = leader(&bytes)
+                    && let Ok(lines) = lines(&bytes, &leader, leader.height, pixel)
+                {
                         prop_assert!(lines.take(1000).all(|line| line.len() <= bytes.len()));
-                    }
                 }
                 let _ = trailer(&bytes);
             }

@@ -117,6 +117,14 @@ pub struct Carrier<M: Model + 'static> {
 const PORT: &str = "1-1";
 const SYSTEM_PATH: &str = "/devices/pci0000:00/0000:00:14.0/usb1/1-1";
 
+impl<M: Model + 'static> std::fmt::Debug for Carrier<M> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Carrier")
+            .field("folder", &self.shared.folder)
+            .finish_non_exhaustive()
+    }
+}
+
 impl<M: Model + 'static> Carrier<M> {
     /// Shows the device of a socket in a folder, which must be empty.
     ///
