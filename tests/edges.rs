@@ -3,6 +3,7 @@
 #[path = "edges/freeform.rs"]
 mod freeform;
 #[path = "edges/part.rs"]
+#[allow(dead_code, reason = "shared with the bench of accuracy")]
 mod part;
 #[path = "inspect/solids.rs"]
 #[allow(dead_code, reason = "shared with the tests of the whole inspection")]
