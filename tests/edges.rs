@@ -124,14 +124,14 @@ fn deviations_total_and_angle_of_a_displaced_and_tilted_edge() {
     assert_eq!(edge.flank_model, [FlankModel::Displaced; 2]);
     for (station, m) in edge.stations.iter().zip(measured(&edge)) {
         let truth = made.true_d(&station.station);
-        for i in 0..2 {
+        for (i, truth) in truth.into_iter().enumerate() {
             assert_near(
                 "d",
                 Quantified {
                     value: m.d_mm[i],
                     u: m.u_d_mm[i],
                 },
-                truth[i],
+                truth,
             );
             assert_eq!(m.u_d_mm[i], m.budget_d[i].u());
         }
@@ -174,12 +174,12 @@ fn a_free_form_edge_is_measured_as_well() {
     for station in &edge.stations {
         let Ok(m) = &station.outcome else { continue };
         let truth = made.true_d(&station.station);
-        for i in 0..2 {
+        for (i, truth) in truth.into_iter().enumerate() {
             let found = Quantified {
                 value: m.d_mm[i],
                 u: m.u_d_mm[i],
             };
-            assert_near("d", found, truth[i]);
+            assert_near("d", found, truth);
         }
         count += 1;
     }

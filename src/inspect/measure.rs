@@ -238,7 +238,9 @@ fn flank_settings(
     FlankSettings {
         reach_mm,
         reach_limit_mm: settings.flank_mm.unwrap_or(4.0 * reach_mm),
-        cut_mm: mixed.max(0.5 * settings.along_mm).min(0.2 * reach_mm),
+        cut_mm: mixed
+            .max(0.5 * settings.along_mm)
+            .clamp(1e-3 * reach_mm, 0.2 * reach_mm),
         spacing_mm: settings.along_mm.max(1e-9),
         min_points: 12,
         keep_designs: false,
