@@ -121,9 +121,9 @@ impl Errors {
                 continue;
             };
             let truth = made.true_d(&station.station);
-            for i in 0..2 {
-                self.error.push(m.d_mm[i] - truth[i]);
-                self.z.push((m.d_mm[i] - truth[i]) / m.u_d_mm[i]);
+            for (i, truth) in truth.iter().enumerate() {
+                self.error.push(m.d_mm[i] - truth);
+                self.z.push((m.d_mm[i] - truth) / m.u_d_mm[i]);
                 self.used += station.points[i] as f64;
             }
         }
@@ -678,8 +678,7 @@ fn scatter_faces(solid: &Solid, cloud: &mut PointCloud, noise: &mut Noise) {
         let clear = edges
             .iter()
             .all(|p| (p.truncate() - sample.point.truncate()).length() > 2.6);
-        let cap = sample.face < 2;
-        if cap && !clear || !cap && !clear || sample.face == 0 {
+        if !clear || sample.face == 0 {
             continue;
         }
         let height = solid.made_at(sample.face, sample.point) + SIGMA * noise.normal();

@@ -3,6 +3,7 @@
 #[path = "edges/freeform.rs"]
 mod freeform;
 #[path = "edges/part.rs"]
+#[allow(dead_code, reason = "shared with the bench of accuracy")]
 mod part;
 #[path = "inspect/solids.rs"]
 #[allow(dead_code, reason = "shared with the tests of the whole inspection")]
@@ -123,14 +124,14 @@ fn deviations_total_and_angle_of_a_displaced_and_tilted_edge() {
     assert_eq!(edge.flank_model, [FlankModel::Displaced; 2]);
     for (station, m) in edge.stations.iter().zip(measured(&edge)) {
         let truth = made.true_d(&station.station);
-        for i in 0..2 {
+        for (i, truth) in truth.into_iter().enumerate() {
             assert_near(
                 "d",
                 Quantified {
                     value: m.d_mm[i],
                     u: m.u_d_mm[i],
                 },
-                truth[i],
+                truth,
             );
             assert_eq!(m.u_d_mm[i], m.budget_d[i].u());
         }
@@ -151,16 +152,21 @@ fn deviations_total_and_angle_of_a_displaced_and_tilted_edge() {
 
 #[test]
 fn flanks_use_all_points_up_to_the_edge_and_no_further_than_asked() {
-    let edge = broken(Break::Sharp, 2);
-    let n: f64 = edge
-        .stations
-        .iter()
-        .flat_map(|s| s.points)
-        .map(|n| n as f64)
-        .sum();
-    let offered = 2.0 * 100.0 * 2.0 * edge.stations.len() as f64;
-    // What noise mixes at 90 degrees lies within 4 sigma of the edge: 2 per cent; a false alarm of the search may cost more.
-    assert!((0.9..1.01).contains(&(n / offered)), "{}", n / offered);
+    let (mut used, mut offered) = (0.0, 0.0);
+    for seed in 21..=26 {
+        let edge = broken(Break::Sharp, seed);
+        // Not the ends: what lies next to another edge of the face is left out there.
+        let inner = &edge.stations[1..edge.stations.len() - 1];
+        used += inner
+            .iter()
+            .flat_map(|s| s.points)
+            .map(|n| n as f64)
+            .sum::<f64>();
+        offered += 2.0 * 100.0 * 2.0 * inner.len() as f64;
+    }
+    // A point's spacing next to the edge is 5 per cent; one false alarm of the search a seed would be another 4.
+    let share = used / offered;
+    assert!((0.9..1.01).contains(&share), "{share}");
 }
 
 #[test]
@@ -173,12 +179,12 @@ fn a_free_form_edge_is_measured_as_well() {
     for station in &edge.stations {
         let Ok(m) = &station.outcome else { continue };
         let truth = made.true_d(&station.station);
-        for i in 0..2 {
+        for (i, truth) in truth.into_iter().enumerate() {
             let found = Quantified {
                 value: m.d_mm[i],
                 u: m.u_d_mm[i],
             };
-            assert_near("d", found, truth[i]);
+            assert_near("d", found, truth);
         }
         count += 1;
     }

@@ -76,7 +76,7 @@ impl Track {
     }
 
     /// Distances of `p` from the edge into the two faces.
-    fn into_faces(&self, p: DVec3) -> [f64; 2] {
+    fn depths(&self, p: DVec3) -> [f64; 2] {
         let mut found = Vec::new();
         self.tree.nearest(p, 1, &mut found);
         match found.first() {
@@ -230,7 +230,7 @@ pub(super) fn zones<B: Body>(
         let other = (p - foot.point).dot(foot.normal);
         Some(ZonePoint {
             s,
-            r: scene.tracks[e].into_faces(p),
+            r: scene.tracks[e].depths(p),
             deviation: if side == 0 {
                 [own, other]
             } else {

@@ -266,7 +266,9 @@ fn flank_settings(
     FlankSettings {
         reach_mm,
         reach_limit_mm: settings.flank_mm.unwrap_or(4.0 * reach_mm),
-        cut_mm: mixed.max(0.5 * settings.along_mm).min(0.2 * reach_mm),
+        cut_mm: mixed
+            .max(settings.along_mm)
+            .clamp(1e-3 * reach_mm, 0.2 * reach_mm),
         spacing_mm: settings.along_mm.max(1e-9),
         min_points: 12,
         keep_designs: false,
@@ -299,7 +301,11 @@ fn all_flanks(
             ..*s
         })
         .collect();
-    let assumed: Vec<[f64; 2]> = settings.iter().map(|s| [2.0 * s.cut_mm; 2]).collect();
+    // Of the other edges of a face more is left out than of the own: a displaced face moves its neighbour's edge.
+    let assumed: Vec<[f64; 2]> = settings
+        .iter()
+        .map(|s| [2.0 * s.cut_mm.max(2.0 * s.spacing_mm); 2])
+        .collect();
     let all: Vec<usize> = (0..settings.len()).collect();
     let mut series = measure(&all, &assumed, scene, &narrow);
     let wide: Vec<bool> = series
@@ -324,6 +330,12 @@ fn all_flanks(
         radius_mm: &room,
         ..*scene
     };
+    let grow: Vec<usize> = (0..settings.len())
+        .filter(|e| wide[*e] && room[*e] > settings[*e].reach_mm)
+        .collect();
+    for (e, pair) in grow.iter().zip(measure(&grow, &assumed, scene, &ample)) {
+        series[*e] = pair;
+    }
     let widest = |s: &FlankSeries| {
         s.stations
             .iter()
@@ -344,10 +356,7 @@ fn all_flanks(
     }
     let again: Vec<usize> = all
         .into_iter()
-        .filter(|e| {
-            let near = scene.edges[*e].faces.iter().any(|f| disturbed[*f as usize]);
-            near || (wide[*e] && settings[*e].reach_limit_mm > settings[*e].reach_mm)
-        })
+        .filter(|e| scene.edges[*e].faces.iter().any(|f| disturbed[*f as usize]))
         .collect();
     for (e, pair) in again.iter().zip(measure(&again, &seen, scene, &ample)) {
         series[*e] = pair;

@@ -315,8 +315,13 @@ impl Zone<'_> {
         let mut accepted = largest;
         let mut refused = largest;
         let mut found = false;
+        // Noise takes points through the centre of a smaller circle, and which of them count then depends on their noise.
+        let least = (3.0 * self.sigma * (0.5 * self.turn).cos()).min(largest);
         for k in 0..40 {
             let r = largest * 0.85f64.powi(k);
+            if r < least {
+                break;
+            }
             if self.score(r) <= ONE_SIDED {
                 accepted = r;
                 found = true;
@@ -325,7 +330,7 @@ impl Zone<'_> {
             refused = r;
         }
         if !found {
-            return refused;
+            return refused.max(least);
         }
         for _ in 0..8 {
             let middle = 0.5 * (accepted + refused);
