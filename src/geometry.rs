@@ -4,10 +4,13 @@ pub mod basis;
 pub mod curve;
 pub mod fit;
 pub mod frame;
+mod nets;
 pub mod newton;
 pub mod nurbs_curve;
 pub mod nurbs_surface;
+mod pieces;
 pub mod rigid;
+mod search;
 pub mod surface;
 pub mod sweep;
 

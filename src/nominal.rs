@@ -2,6 +2,7 @@
 
 mod bodies;
 mod build;
+mod corner;
 mod error;
 mod extremes;
 mod face;
@@ -17,6 +18,7 @@ use std::path::Path;
 
 use glam::DVec3;
 
+pub use corner::{Corner, End};
 pub use error::NominalError;
 pub use face::{Face, SurfaceSample};
 pub use sharp::{MIN_TURN_ANGLE_RAD, SharpEdge};
@@ -79,6 +81,7 @@ pub struct Nominal {
     pub bounding_box_mm: [DVec3; 2],
     /// Smallest and largest coordinates of the faces alone, mm.
     pub faces_box_mm: [DVec3; 2],
+    corners: Vec<Corner>,
 }
 
 /// A bounded curve of a wireframe.
@@ -149,6 +152,11 @@ impl Nominal {
             });
         }
         build::build(bytes, name)
+    }
+
+    /// Where sharp edges end: corners of the part, and places where one edge goes on or fades.
+    pub fn corners(&self) -> &[Corner] {
+        &self.corners
     }
 
     /// Area of all faces, mm2.

@@ -6,7 +6,7 @@ mod hostile;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::path::{Path, PathBuf};
 
-use acies::nominal::{EdgeKind, Nominal};
+use acies::nominal::{EdgeKind, End, Nominal};
 use glam::DVec3;
 use proptest::prelude::*;
 
@@ -77,6 +77,27 @@ fn stations_of_a_box_look_out_of_it_and_into_its_faces() {
         let (s, d) = e.nearest(middle.point + middle.normals[0] * 0.25);
         assert!((s - middle.s_mm).abs() < 1e-9 && (d - 0.25).abs() < 1e-12);
     }
+}
+
+#[test]
+fn a_box_has_eight_corners_of_three_edges_and_a_cylinder_none() {
+    let n = parse(BOX);
+    assert_eq!(n.corners().len(), 8);
+    for c in n.corners() {
+        assert!(c.is_vertex());
+        assert_eq!((c.edges.len(), c.faces.len()), (3, 3));
+        for (edge, end) in &c.edges {
+            let e = &n.sharp_edges[*edge];
+            let s_mm = if *end == End::Start { 0.0 } else { e.length_mm };
+            assert!(e.point(s_mm).distance(c.position) < 1e-12);
+            assert!(e.faces.iter().all(|f| c.faces.contains(f)));
+        }
+        let [low, high] = n.bounding_box_mm;
+        for k in 0..3 {
+            assert!(c.position[k] == low[k] || c.position[k] == high[k]);
+        }
+    }
+    assert_eq!(parse(CYLINDER).corners(), [], "its edges are rings");
 }
 
 #[test]

@@ -34,8 +34,8 @@ struct Summary {
     edges: usize,
     sharp_edges: usize,
     wires: usize,
-    bounding_box_mm: [f64; 6],
-    faces_bounding_box_mm: [f64; 6],
+    bounding_box_mm: [[f64; 3]; 2],
+    faces_bounding_box_mm: [[f64; 3]; 2],
     area_mm2: f64,
     edge_length_mm: f64,
     refused: Vec<Refusal>,
@@ -89,8 +89,8 @@ impl Nominals {
     }
 }
 
-fn corners([low, high]: [DVec3; 2]) -> [f64; 6] {
-    [low.x, low.y, low.z, high.x, high.y, high.z]
+fn triples(bounds: [DVec3; 2]) -> [[f64; 3]; 2] {
+    bounds.map(|p| p.to_array())
 }
 
 fn summarise(nominal: &Nominal, edges: bool, start: Instant) -> Summary {
@@ -106,8 +106,8 @@ fn summarise(nominal: &Nominal, edges: bool, start: Instant) -> Summary {
         edges: nominal.edges.len(),
         sharp_edges: nominal.sharp_edges.len(),
         wires: nominal.wires.len(),
-        bounding_box_mm: corners(nominal.bounding_box_mm),
-        faces_bounding_box_mm: corners(nominal.faces_box_mm),
+        bounding_box_mm: triples(nominal.bounding_box_mm),
+        faces_bounding_box_mm: triples(nominal.faces_box_mm),
         area_mm2: nominal.area_mm2(),
         edge_length_mm: nominal.edge_length_mm(),
         refused: refused.collect(),
@@ -140,7 +140,7 @@ fn row(nominal: &Nominal, edge: &SharpEdge) -> EdgeRow {
 }
 
 fn table(s: &Summary) -> String {
-    let b = &s.bounding_box_mm;
+    let [low, high] = s.bounding_box_mm;
     let mut out = vec![
         format!("part          {}", s.part),
         format!("bodies        {}", s.bodies),
@@ -149,7 +149,7 @@ fn table(s: &Summary) -> String {
         format!("sharp edges   {}", s.sharp_edges),
         format!(
             "box           {:.3} {:.3} {:.3} to {:.3} {:.3} {:.3} mm",
-            b[0], b[1], b[2], b[3], b[4], b[5]
+            low[0], low[1], low[2], high[0], high[1], high[2]
         ),
     ];
     if s.wires > 0 {

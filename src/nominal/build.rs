@@ -21,6 +21,8 @@ const MAX_FACES: usize = 200_000;
 const MAX_POINTS: usize = 20_000_000;
 /// Chord of the polylines that bound a face, as a share of the edge's length.
 const CHORD: f64 = 8e-6;
+/// Ends of edges nearer than this share of the part's size are one corner: writers round coordinates to 1e-6 of it and worse.
+const CORNER_GAP: f64 = 1e-5;
 
 /// Reads a nominal from the text of a STEP file.
 pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
@@ -505,6 +507,8 @@ impl<'a> Builder<'a> {
             s.id = format!("e{}", i + 1);
         }
         let faces_box_mm = bounding_box(&self.faces, &self.edges);
+        let size_mm = faces_box_mm[0].distance(faces_box_mm[1]);
+        let corners = super::corner::corners(&sharp_edges, CORNER_GAP * size_mm);
         let wires = self.wires.iter().flat_map(|w| {
             let path = Path::new(w.curve.clone(), w.range);
             path.polyline(CHORD * w.length_mm)
@@ -533,6 +537,7 @@ impl<'a> Builder<'a> {
             wires: self.wires,
             bounding_box_mm,
             faces_box_mm,
+            corners,
         }
     }
 }
