@@ -43,7 +43,9 @@ fn row(file: &Path, name: &str, o: &Value) -> String {
         Ok(n) => n,
         Err(e) => {
             let said = e.to_string();
-            let said = said.split_once(&format!("{name}: ")).map_or(&said[..], |s| s.1);
+            let said = said
+                .split_once(&format!("{name}: "))
+                .map_or(&said[..], |s| s.1);
             return format!("| {name} | - | - | - | - | - | - | refused: {said} |");
         }
     };
@@ -51,7 +53,10 @@ fn row(file: &Path, name: &str, o: &Value) -> String {
     let number = |key: &str| o[key].as_f64().unwrap_or(f64::NAN);
     let wires: f64 = n.wires.iter().map(|w| w.length_mm).sum();
     let area = n.area_mm2() / number("area_mm2") - 1.0;
-    let length = (n.edge_length_mm() + wires) / number("edge_length_sum_mm") - 1.0;
+    // An IGES file bounds each face by itself: Open CASCADE counts an edge with each.
+    let times = |faces: usize| if name.contains(".ig") { faces as f64 } else { 1.0 };
+    let edges = n.edges.iter().map(|e| times(e.faces.len()) * e.length_mm);
+    let length = (edges.sum::<f64>() + wires) / number("edge_length_sum_mm") - 1.0;
     let [low, high] = n.bounding_box_mm;
     let mine = [low.to_array(), high.to_array()].concat();
     let theirs = o["bbox_mm"].as_array().cloned().unwrap_or_default();

@@ -1,6 +1,7 @@
 //! Rigid transforms, fits with residuals and covariance, NURBS curves and surfaces.
 
 pub mod basis;
+mod convert;
 pub mod curve;
 pub mod fit;
 pub mod frame;

@@ -6,6 +6,10 @@ mod corner;
 mod error;
 mod extremes;
 mod face;
+mod iges;
+mod iges_build;
+mod iges_shapes;
+mod net;
 mod part21;
 mod path;
 mod shapes;
@@ -127,7 +131,7 @@ pub struct Refused {
 const MAX_BYTES: u64 = 512 << 20;
 
 impl Nominal {
-    /// The part in a STEP file (AP203, AP214, AP242).
+    /// The part in a STEP (AP203, AP214, AP242) or IGES file; the first line tells which.
     pub fn read(path: &Path) -> Result<Self, NominalError> {
         let name = path.display().to_string();
         let failed = |source| NominalError::Io {
@@ -142,7 +146,7 @@ impl Nominal {
         Self::parse(&bytes, &name)
     }
 
-    /// The part in the text of a STEP file; `name` is for messages.
+    /// The part in the text of a STEP or IGES file; `name` is for messages.
     pub fn parse(bytes: &[u8], name: &str) -> Result<Self, NominalError> {
         if bytes.len() as u64 > MAX_BYTES {
             return Err(NominalError::TooLarge {
@@ -150,6 +154,9 @@ impl Nominal {
                 bytes: bytes.len() as u64,
                 limit: MAX_BYTES,
             });
+        }
+        if iges::is_iges(bytes) {
+            return iges_build::build(bytes, name);
         }
         build::build(bytes, name)
     }

@@ -101,7 +101,11 @@ impl<'a> Nets<'a> {
         let (u, v) = (spans[0] - ku.degree(), spans[1] - kv.degree());
         let rows = (ku.degree() + 1).saturating_sub(a);
         let columns = (kv.degree() + 1).saturating_sub(b);
-        (u..u + rows).flat_map(move |i| net[i * stride + v..i * stride + v + columns].iter().copied())
+        (u..u + rows).flat_map(move |i| {
+            net[i * stride + v..i * stride + v + columns]
+                .iter()
+                .copied()
+        })
     }
 }
 

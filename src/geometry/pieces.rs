@@ -15,6 +15,8 @@ pub(super) struct Pieces {
     /// First piece that may hold parameters of each equal part of the domain.
     buckets: Vec<u32>,
     buckets_per_unit: f64,
+    /// Whether the domain ends, or the first derivative may jump, at each of the breaks.
+    creases: Vec<bool>,
     /// Middle and inverse half width of each piece.
     scales: Vec<(f64, f64)>,
     /// Per piece `n * n` numbers, power by power: the coefficients of its `n` functions. Empty above the highest degree.
@@ -47,7 +49,15 @@ impl Pieces {
                 push_polynomials(knots, *span, (w[0], w[1]), &mut coefficients);
             }
         }
+        let k = knots.as_slice();
+        let smooth = |b: &f64| {
+            let first = k.partition_point(|t| t < b);
+            k[first..].partition_point(|t| t <= b) < knots.degree()
+        };
+        let inner = |i: usize| i > 0 && i < count;
+        let creases = breaks.iter().enumerate();
         Self {
+            creases: creases.map(|(i, b)| !inner(i) || !smooth(b)).collect(),
             buckets: (0..=parts).map(bucket).collect(),
             buckets_per_unit: parts as f64 / (to - from),
             breaks,
@@ -65,6 +75,11 @@ impl Pieces {
     /// Index of the knot at which a piece begins.
     pub fn span_of(&self, piece: usize) -> usize {
         self.spans[piece]
+    }
+
+    /// Whether a piece ends, below and above, at an end of the domain or where the first derivative may jump.
+    pub fn creases(&self, piece: usize) -> [bool; 2] {
+        [self.creases[piece], self.creases[piece + 1]]
     }
 
     /// The piece that holds `t`, a parameter of the domain.

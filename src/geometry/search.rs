@@ -12,9 +12,9 @@ use super::nets::{Nets, Third};
 use super::newton::{Range, SurfaceDerivatives, nearest_on_surface};
 
 /// Patches of the tree of one surface.
-const MAX_PATCHES: usize = 1 << 17;
+const MAX_PATCHES: usize = 1 << 14;
 /// Halvings of one piece for the tree.
-const MAX_SPLITS: usize = 5;
+const MAX_SPLITS: u32 = 6;
 /// Patches that one search may halve: without it a point on the axis of a tube would look at all of it.
 const BUDGET: usize = 4_000;
 /// Patches smaller than this share of the surface are not halved.
@@ -49,6 +49,8 @@ struct Patch {
     /// At the middle, by parameters that run from -1 to 1.
     at: SurfaceDerivatives,
     third: Third,
+    /// Whether it ends, below and above in u and in v, where the surface ends or has a crease.
+    ends: [[bool; 2]; 2],
     /// Axes of its box, its middle and half extents.
     axes: [DVec3; 3],
     centre: DVec3,
@@ -61,7 +63,13 @@ struct Patch {
 
 impl Patch {
     /// From the derivatives at its middle by the surface's own parameters.
-    fn new(middle: [f64; 2], half: [f64; 2], d: SurfaceDerivatives, third: Third) -> Self {
+    fn new(
+        middle: [f64; 2],
+        half: [f64; 2],
+        d: SurfaceDerivatives,
+        third: Third,
+        ends: [[bool; 2]; 2],
+    ) -> Self {
         let [hu, hv] = half;
         let at = SurfaceDerivatives {
             point: d.point,
@@ -101,6 +109,7 @@ impl Patch {
             half,
             at,
             third,
+            ends,
             axes,
             centre,
             extent: DVec3::from(extent),
@@ -117,13 +126,19 @@ impl Patch {
     #[inline]
     fn bound(&self, p: DVec3) -> f64 {
         let d = p - self.centre;
-        let local = DVec3::new(d.dot(self.axes[0]), d.dot(self.axes[1]), d.dot(self.axes[2]));
-        (local.abs() - self.extent).max(DVec3::ZERO).length_squared()
+        let local = DVec3::new(
+            d.dot(self.axes[0]),
+            d.dot(self.axes[1]),
+            d.dot(self.axes[2]),
+        );
+        (local.abs() - self.extent)
+            .max(DVec3::ZERO)
+            .length_squared()
     }
 
-    /// Gradient and Hessian of half the squared distance at the middle, and whether it is convex all over the patch.
+    /// Gradient and Hessian of half the squared distance at the middle, and what they say of the whole patch.
     #[inline]
-    fn model(&self, p: DVec3) -> ([f64; 2], [f64; 3], bool) {
+    fn model(&self, p: DVec3) -> ([f64; 2], [f64; 3], Verdict) {
         let d = &self.at;
         let r = d.point - p;
         let gradient = [d.du.dot(r), d.dv.dot(r)];
@@ -136,7 +151,31 @@ impl Patch {
         let [euu, euv, evv] = self.drift.map(|[own, per_mm]| own + per_mm * far);
         let (uu, vv) = (hessian[0] - euu, hessian[2] - evv);
         let uv = hessian[1].abs() + euv;
-        (gradient, hessian, uu > 0.0 && vv > 0.0 && uu * vv > uv * uv)
+        let verdict = if uu > 0.0 && vv > 0.0 && uu * vv > uv * uv {
+            Verdict::Convex
+        } else if self.has_no_minimum(gradient, hessian, [euu, euv, evv]) {
+            Verdict::Nothing
+        } else {
+            Verdict::Open
+        };
+        (gradient, hessian, verdict)
+    }
+
+    /// Whether the distance falls towards a neighbour, or is bent downwards, all over the patch.
+    ///
+    /// At a border on which nothing follows smoothly a falling distance has a minimum all the same, at that border.
+    fn has_no_minimum(&self, g: [f64; 2], h: [f64; 3], drift: [f64; 3]) -> bool {
+        let change = [
+            h[0].abs() + h[1].abs() + drift[0] + drift[1],
+            h[2].abs() + h[1].abs() + drift[2] + drift[1],
+        ];
+        let bent = [h[0] + drift[0] < 0.0, h[2] + drift[2] < 0.0];
+        (0..2).any(|k| {
+            let [below, above] = self.ends[k];
+            (g[k] > change[k] && !below)
+                || (-g[k] > change[k] && !above)
+                || (bent[k] && !below && !above)
+        })
     }
 
     fn ranges(&self) -> [Range; 2] {
@@ -159,11 +198,13 @@ impl Patch {
             let order = if k == 0 { 3 - i } else { i };
             *t *= 0.5f64.powi(order as i32);
         }
-        [-1.0, 1.0].map(|side| {
+        [0, 1].map(|side| {
             let mut middle = self.middle;
-            middle[k] += side * half[k];
+            middle[k] += [-half[k], half[k]][side];
+            let mut ends = self.ends;
+            ends[k][1 - side] = false;
             let d = surface.derivatives(middle[0], middle[1]);
-            Self::new(middle, half, d, third)
+            Self::new(middle, half, d, third, ends)
         })
     }
 
@@ -174,11 +215,24 @@ impl Patch {
             self.at.du.dot(self.at.dv),
             self.at.dv.length_squared(),
         ];
-        let [euu, euv, evv] = self.drift.map(|[own, per_mm]| own + per_mm * 2.0 * self.reach);
+        let [euu, euv, evv] = self
+            .drift
+            .map(|[own, per_mm]| own + per_mm * 2.0 * self.reach);
         let (uu, vv) = (e - euu, g - evv);
         let uv = f.abs() + euv;
         uu > 0.0 && vv > 0.0 && uu * vv > uv * uv
     }
+}
+
+/// What bounds say of the distance over a whole patch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Verdict {
+    /// One minimum, which Newton's method finds.
+    Convex,
+    /// No minimum of the surface lies here.
+    Nothing,
+    /// Neither is sure.
+    Open,
 }
 
 /// The best point so far.
@@ -199,19 +253,27 @@ impl Best {
 impl Search {
     /// The tree of a surface.
     pub fn new(surface: &NurbsSurface) -> Self {
-        let nets = Nets::new(surface.knots(), surface.homogeneous(), surface.is_rational());
+        let nets = Nets::new(
+            surface.knots(),
+            surface.homogeneous(),
+            surface.is_rational(),
+        );
         let [pu, pv] = surface.pieces();
         let mut patches = Vec::new();
         let count = (pu.breaks().len() - 1) * (pv.breaks().len() - 1);
+        // Many pieces are many patches already.
+        let splits = (MAX_PATCHES / count)
+            .checked_ilog2()
+            .unwrap_or(0)
+            .min(MAX_SPLITS);
         for (i, u) in pu.breaks().windows(2).enumerate() {
             for (j, v) in pv.breaks().windows(2).enumerate() {
                 let middle = [0.5 * (u[0] + u[1]), 0.5 * (v[0] + v[1])];
                 let half = [0.5 * (u[1] - u[0]), 0.5 * (v[1] - v[0])];
                 let d = surface.derivatives(middle[0], middle[1]);
                 let third = nets.third([pu.span_of(i), pv.span_of(j)], half, d.point);
-                let whole = Patch::new(middle, half, d, third);
-                // Many pieces are many patches already.
-                let splits = if count > MAX_PATCHES / 64 { 0 } else { MAX_SPLITS };
+                let ends = [pu.creases(i), pv.creases(j)];
+                let whole = Patch::new(middle, half, d, third, ends);
                 split(surface, whole, splits, &mut patches);
             }
         }
@@ -325,19 +387,30 @@ impl Search {
                 *best = Best { uv, d2 };
             }
         };
-        let (gradient, hessian, convex) = patch.model(p);
-        if convex {
-            let (uv, d2) = descend(surface, p, patch, gradient, hessian);
-            take(uv, d2, best);
-            return;
+        let middle = |patch: &Patch, best: &mut Best| {
+            let uv = (patch.middle[0], patch.middle[1]);
+            take(uv, patch.at.point.distance_squared(p), best);
+        };
+        let (gradient, hessian, verdict) = patch.model(p);
+        match verdict {
+            Verdict::Nothing => return,
+            Verdict::Convex => {
+                let (uv, d2) = descend(surface, p, patch, gradient, hessian);
+                take(uv, d2, best);
+                return;
+            }
+            Verdict::Open => {}
         }
-        let whole = surface.ranges();
         let from = |middle: [f64; 2]| {
             let start = (middle[0], middle[1]);
+            let whole = surface.ranges();
             nearest_on_surface(|u, v| surface.derivatives(u, v), p, start, whole)
         };
-        let (uv, d2) = from(patch.middle);
-        take(uv, d2, best);
+        if best.d2.is_infinite() {
+            let (uv, d2) = from(patch.middle);
+            take(uv, d2, best);
+        }
+        middle(patch, best);
         let mut open: Vec<Patch> = patch.halves(surface).into();
         let mut left = BUDGET;
         while let Some(patch) = open.pop() {
@@ -345,11 +418,15 @@ impl Search {
             if patch.bound(p) >= best.d2 * (1.0 - 1e-14) {
                 continue;
             }
-            let (gradient, hessian, convex) = patch.model(p);
-            if convex {
-                let (uv, d2) = descend(surface, p, &patch, gradient, hessian);
-                take(uv, d2, best);
-                continue;
+            let (gradient, hessian, verdict) = patch.model(p);
+            match verdict {
+                Verdict::Nothing => continue,
+                Verdict::Convex => {
+                    let (uv, d2) = descend(surface, p, &patch, gradient, hessian);
+                    take(uv, d2, best);
+                    continue;
+                }
+                Verdict::Open => {}
             }
             if left == 0 || patch.reach < SMALLEST * self.size {
                 let (uv, d2) = from(patch.middle);
@@ -357,8 +434,13 @@ impl Search {
                 continue;
             }
             left -= 1;
+            middle(&patch, best);
             let [a, b] = patch.halves(surface);
-            let (near, far) = if a.bound(p) < b.bound(p) { (a, b) } else { (b, a) };
+            let (near, far) = if a.bound(p) < b.bound(p) {
+                (a, b)
+            } else {
+                (b, a)
+            };
             open.push(far);
             open.push(near);
         }
@@ -442,7 +524,7 @@ fn boxed_minimum(x: [f64; 2], g: [f64; 2], [a, b, c]: [f64; 3]) -> [f64; 2] {
     best.1
 }
 
-fn split(surface: &NurbsSurface, patch: Patch, splits: usize, out: &mut Vec<Patch>) {
+fn split(surface: &NurbsSurface, patch: Patch, splits: u32, out: &mut Vec<Patch>) {
     if splits == 0 || patch.is_simple() {
         out.push(patch);
         return;

@@ -66,7 +66,10 @@ pub(super) fn corners(edges: &[SharpEdge], gap_mm: f64) -> Vec<Corner> {
     }
     let corner = |members: Vec<usize>| {
         let sum: DVec3 = members.iter().map(|k| ends[*k].2).sum();
-        let mut faces: Vec<u32> = members.iter().flat_map(|k| edges[ends[*k].0].faces).collect();
+        let mut faces: Vec<u32> = members
+            .iter()
+            .flat_map(|k| edges[ends[*k].0].faces)
+            .collect();
         faces.sort_unstable();
         faces.dedup();
         Corner {
@@ -76,9 +79,5 @@ pub(super) fn corners(edges: &[SharpEdge], gap_mm: f64) -> Vec<Corner> {
         }
     };
     let ring = |c: &Corner| matches!(c.edges[..], [(a, _), (b, _)] if a == b);
-    nodes
-        .into_iter()
-        .map(corner)
-        .filter(|c| !ring(c))
-        .collect()
+    nodes.into_iter().map(corner).filter(|c| !ring(c)).collect()
 }
