@@ -14,7 +14,28 @@ const LENGTH_SHARE: f64 = 1e-6;
 const AREA_SHARE: f64 = 1e-4;
 
 /// Why a file's answer differs, where it does.
-const REASONS: &[(&str, &str)] = &[];
+const REASONS: &[(&str, &str)] = &[
+    (
+        "IPP_simple_AP203.stp",
+        "length: Open CASCADE adds the seam of a closed face; the file has 14 edges, it counts 15",
+    ),
+    (
+        "pyocc_as1_pe_203.stp",
+        "length: Open CASCADE adds seams of closed faces that the file does not have",
+    ),
+    (
+        "pyocc_face_recognition_sample_part.stp",
+        "length: Open CASCADE adds seams of closed faces that the file does not have; the file has 56 edges, it counts 72 with wires",
+    ),
+    (
+        "DCX_DaimlerChryslerTestPart.igs",
+        "area: Open CASCADE itself gives the same part as a solid (AP214) 67,024 mm2, which is ours to 1e-4",
+    ),
+    (
+        "pyocc_surf114.igs",
+        "length: a surface that closes on itself has no seam here, and two in Open CASCADE",
+    ),
+];
 
 fn main() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
@@ -54,7 +75,13 @@ fn row(file: &Path, name: &str, o: &Value) -> String {
     let wires: f64 = n.wires.iter().map(|w| w.length_mm).sum();
     let area = n.area_mm2() / number("area_mm2") - 1.0;
     // An IGES file bounds each face by itself: Open CASCADE counts an edge with each.
-    let times = |faces: usize| if name.contains(".ig") { faces as f64 } else { 1.0 };
+    let times = |faces: usize| {
+        if name.contains(".ig") {
+            faces as f64
+        } else {
+            1.0
+        }
+    };
     let edges = n.edges.iter().map(|e| times(e.faces.len()) * e.length_mm);
     let length = (edges.sum::<f64>() + wires) / number("edge_length_sum_mm") - 1.0;
     let [low, high] = n.bounding_box_mm;

@@ -2,6 +2,7 @@
 
 mod bodies;
 mod build;
+mod closest;
 mod corner;
 mod error;
 mod extremes;
@@ -12,6 +13,7 @@ mod iges_shapes;
 mod net;
 mod part21;
 mod path;
+mod pmi;
 mod shapes;
 mod sharp;
 mod trim;
@@ -25,6 +27,7 @@ use glam::DVec3;
 pub use corner::{Corner, End};
 pub use error::NominalError;
 pub use face::{Face, SurfaceSample};
+pub use pmi::{Measure, Pmi, PmiKind};
 pub use sharp::{MIN_TURN_ANGLE_RAD, SharpEdge};
 
 use crate::geometry::Curve;
@@ -86,6 +89,11 @@ pub struct Nominal {
     /// Smallest and largest coordinates of the faces alone, mm.
     pub faces_box_mm: [DVec3; 2],
     corners: Vec<Corner>,
+    pmi: Vec<Pmi>,
+    /// Of `edges`, by arc length.
+    paths: Vec<path::Path>,
+    /// Indices of the edges that bound each face.
+    borders: Vec<Vec<u32>>,
 }
 
 /// A bounded curve of a wireframe.
@@ -164,6 +172,11 @@ impl Nominal {
     /// Where sharp edges end: corners of the part, and places where one edge goes on or fades.
     pub fn corners(&self) -> &[Corner] {
         &self.corners
+    }
+
+    /// Dimensions, tolerances and datum features that an AP242 file carries; empty for other files.
+    pub fn pmi(&self) -> &[Pmi] {
+        &self.pmi
     }
 
     /// Area of all faces, mm2.

@@ -54,27 +54,7 @@ impl<'a> Nets<'a> {
         if !self.rational {
             return thirds.map(|(a, b)| of(a, b).0);
         }
-        // With A = w T for T = S - centre: w T_ab = A_ab - the sum over lower orders of T (Leibniz).
-        let least = self.least_weight(spans);
-        let mut bounds: Orders<(f64, f64)> = [(0.0, 0.0); 16];
-        let mut t: Orders<f64> = [0.0; 16];
-        for order in 0..=ORDER {
-            for a in 0..=order {
-                let b = order - a;
-                bounds[a * 4 + b] = of(a, b);
-                let mut sum = bounds[a * 4 + b].0;
-                for i in 0..=a {
-                    for j in 0..=b {
-                        if (i, j) != (a, b) {
-                            let weight = bounds[(a - i) * 4 + b - j].1;
-                            sum += choose(a, i) * choose(b, j) * weight * t[i * 4 + j];
-                        }
-                    }
-                }
-                t[a * 4 + b] = sum / least;
-            }
-        }
-        thirds.map(|(a, b)| t[a * 4 + b])
+        leibniz(self.least_weight(spans), of)
     }
 
     /// Largest length of A - centre w, and of w, over the control points that a piece uses.
@@ -106,6 +86,100 @@ impl<'a> Nets<'a> {
                 .iter()
                 .copied()
         })
+    }
+}
+
+/// Bounds on the third derivatives of T = S - centre, where A = w T: w T_ab is A_ab less the lower orders of T.
+///
+/// `of` gives bounds on the lengths of the derivatives of A and of w, `least` is the smallest weight.
+fn leibniz(least: f64, of: impl Fn(usize, usize) -> (f64, f64)) -> Third {
+    let mut bounds: Orders<(f64, f64)> = [(0.0, 0.0); 16];
+    let mut t: Orders<f64> = [0.0; 16];
+    for order in 0..=ORDER {
+        for a in 0..=order {
+            let b = order - a;
+            bounds[a * 4 + b] = of(a, b);
+            let mut sum = bounds[a * 4 + b].0;
+            for i in 0..=a {
+                for j in 0..=b {
+                    if (i, j) != (a, b) {
+                        let weight = bounds[(a - i) * 4 + b - j].1;
+                        sum += choose(a, i) * choose(b, j) * weight * t[i * 4 + j];
+                    }
+                }
+            }
+            t[a * 4 + b] = sum / least;
+        }
+    }
+    [(3, 0), (2, 1), (1, 2), (0, 3)].map(|(a, b)| t[a * 4 + b])
+}
+
+/// One polynomial piece of a surface in powers of x and y from -1 to 1, homogeneous: bounds over any part of it.
+pub(super) struct Powers {
+    /// x^i y^j at `i * SIDE + j`.
+    coefficients: [DVec4; SIDE * SIDE],
+    rational: bool,
+}
+
+/// Powers of each parameter.
+const SIDE: usize = super::pieces::MAX_DEGREE + 1;
+
+impl Powers {
+    /// The coefficients of a piece.
+    pub fn new(coefficients: [DVec4; SIDE * SIDE], rational: bool) -> Self {
+        Self {
+            coefficients,
+            rational,
+        }
+    }
+
+    /// Bounds over the part with this middle and half widths (of -1 to 1), in parameters that run from -1 to 1 on it.
+    pub fn third(&self, middle: [f64; 2], half: [f64; 2], centre: DVec3) -> Third {
+        // Taylor's series about the middle; it ends with the degree, so its sum of lengths is a bound.
+        let mut q = self.coefficients;
+        for line in 0..SIDE {
+            shift(&mut q, line * SIDE, 1, middle[1], half[1]);
+        }
+        for line in 0..SIDE {
+            shift(&mut q, line, SIDE, middle[0], half[0]);
+        }
+        let falling = |n: usize, k: usize| ((n + 1 - k)..=n).product::<usize>() as f64;
+        let of = |a: usize, b: usize| {
+            let mut out = (0.0, 0.0);
+            for i in a..SIDE {
+                for j in b..SIDE {
+                    let c = q[i * SIDE + j];
+                    let times = falling(i, a) * falling(j, b);
+                    out.0 += times * (c.truncate() - centre * c.w).length();
+                    out.1 += times * c.w.abs();
+                }
+            }
+            out
+        };
+        if !self.rational {
+            return [(3, 0), (2, 1), (1, 2), (0, 3)].map(|(a, b)| of(a, b).0);
+        }
+        let spread: f64 = q[1..].iter().map(|c| c.w.abs()).sum();
+        let least = q[0].w - spread;
+        if least <= 0.0 {
+            return [f64::INFINITY; 4];
+        }
+        leibniz(least, of)
+    }
+}
+
+/// A polynomial in x as one in y, where x = middle + half y.
+fn shift(q: &mut [DVec4], start: usize, stride: usize, middle: f64, half: f64) {
+    for first in 0..SIDE {
+        for i in (first..SIDE - 1).rev() {
+            let above = q[start + (i + 1) * stride];
+            q[start + i * stride] += above * middle;
+        }
+    }
+    let mut scale = 1.0;
+    for i in 0..SIDE {
+        q[start + i * stride] *= scale;
+        scale *= half;
     }
 }
 

@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use super::RigidTransform;
 use super::basis::{Basis, Knots};
+use super::nets::Powers;
 use super::newton::{Range, SurfaceDerivatives, nearest_on_surface};
 use super::nurbs_curve::{NurbsError, homogeneous};
 use super::pieces::Pieces;
@@ -250,6 +251,30 @@ impl NurbsSurface {
 
     pub(super) fn is_rational(&self) -> bool {
         self.rational
+    }
+
+    /// One polynomial piece in powers; `None` where a degree is too high for that.
+    pub(super) fn powers(&self, i: usize, j: usize) -> Option<Powers> {
+        let [pu, pv] = self.pieces();
+        let (cu, cv) = (pu.coefficients(i), pv.coefficients(j));
+        if cu.is_empty() || cv.is_empty() {
+            return None;
+        }
+        let (n, m) = (self.knots_u.degree() + 1, self.knots_v.degree() + 1);
+        let (u, v) = (pu.span_of(i) + 1 - n, pv.span_of(j) + 1 - m);
+        let side = super::pieces::MAX_DEGREE + 1;
+        let mut out = [DVec4::ZERO; 36];
+        for k in 0..n {
+            let row = &self.points[(u + k) * self.knots_v.points() + v..][..m];
+            for b in 0..m {
+                let across = (row.iter().zip(&cv[b * m..])).map(|(p, c)| *p * *c);
+                let across: DVec4 = across.sum();
+                for a in 0..n {
+                    out[a * side + b] += across * cu[a * n + k];
+                }
+            }
+        }
+        Some(Powers::new(out, self.rational))
     }
 
     pub(super) fn pieces(&self) -> [&Pieces; 2] {

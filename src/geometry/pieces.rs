@@ -3,7 +3,7 @@
 use super::basis::Knots;
 
 /// Highest degree for which polynomials are kept: above it their coefficients cost digits.
-const MAX_DEGREE: usize = 5;
+pub(super) const MAX_DEGREE: usize = 5;
 
 /// The pieces of a knot vector: quick search, and the basis functions on each in powers of x = -1 to 1.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,6 +75,12 @@ impl Pieces {
     /// Index of the knot at which a piece begins.
     pub fn span_of(&self, piece: usize) -> usize {
         self.spans[piece]
+    }
+
+    /// Coefficients of a piece, power by power; empty above the highest degree.
+    pub fn coefficients(&self, piece: usize) -> &[f64] {
+        let per_piece = self.coefficients.len() / self.spans.len();
+        &self.coefficients[piece * per_piece..][..per_piece]
     }
 
     /// Whether a piece ends, below and above, at an end of the domain or where the first derivative may jump.

@@ -5,6 +5,8 @@
 //! on those where the distance is convex, Newton's method finds the one minimum there is; others are halved. What remains
 //! in the end is the global minimum, up to the size of the smallest patch where the distance is the same along a whole curve.
 
+use std::cell::OnceCell;
+
 use glam::DVec3;
 
 use super::NurbsSurface;
@@ -12,15 +14,16 @@ use super::nets::{Nets, Third};
 use super::newton::{Range, SurfaceDerivatives, nearest_on_surface};
 
 /// Patches of the tree of one surface.
-const MAX_PATCHES: usize = 1 << 14;
+const MAX_PATCHES: usize = 1 << 15;
 /// Halvings of one piece for the tree.
-const MAX_SPLITS: u32 = 6;
-/// Patches that one search may halve: without it a point on the axis of a tube would look at all of it.
-const BUDGET: usize = 4_000;
+const MAX_SPLITS: u32 = 4;
+/// Patches that one search may halve: without it a point on the axis of a tube would look at all of it. The proof needs tens;
+/// points at nearly the same distance from a long stretch need thousands.
+const BUDGET: usize = 100_000;
 /// Patches smaller than this share of the surface are not halved.
 const SMALLEST: f64 = 1e-7;
 /// Steps of Newton's method on a patch on which the distance is convex.
-const STEPS: usize = 12;
+const STEPS: usize = 40;
 
 /// The tree of one surface.
 #[derive(Debug, Clone, PartialEq)]
@@ -120,6 +123,21 @@ impl Patch {
                 [2.0 * v * to_v + to_v * to_v + reach * vv, to_vv],
             ],
         }
+    }
+
+    /// The same patch with other bounds on its third derivatives.
+    fn bounded(&self, third: Third) -> Self {
+        let [hu, hv] = self.half;
+        let at = &self.at;
+        let d = SurfaceDerivatives {
+            point: at.point,
+            du: at.du / hu,
+            dv: at.dv / hv,
+            duu: at.duu / (hu * hu),
+            duv: at.duv / (hu * hv),
+            dvv: at.dvv / (hv * hv),
+        };
+        Self::new(self.middle, self.half, d, third, self.ends)
     }
 
     /// Squared distance of a point from the box: no point of the patch is nearer.
@@ -253,11 +271,17 @@ impl Best {
 impl Search {
     /// The tree of a surface.
     pub fn new(surface: &NurbsSurface) -> Self {
-        let nets = Nets::new(
-            surface.knots(),
-            surface.homogeneous(),
-            surface.is_rational(),
-        );
+        let nets = OnceCell::new();
+        let nets = || {
+            let new = || {
+                Nets::new(
+                    surface.knots(),
+                    surface.homogeneous(),
+                    surface.is_rational(),
+                )
+            };
+            nets.get_or_init(new)
+        };
         let [pu, pv] = surface.pieces();
         let mut patches = Vec::new();
         let count = (pu.breaks().len() - 1) * (pv.breaks().len() - 1);
@@ -271,10 +295,25 @@ impl Search {
                 let middle = [0.5 * (u[0] + u[1]), 0.5 * (v[0] + v[1])];
                 let half = [0.5 * (u[1] - u[0]), 0.5 * (v[1] - v[0])];
                 let d = surface.derivatives(middle[0], middle[1]);
-                let third = nets.third([pu.span_of(i), pv.span_of(j)], half, d.point);
+                let powers = surface.powers(i, j);
+                let third = |middle_of: [f64; 2], half_of: [f64; 2], centre: DVec3| match &powers {
+                    Some(powers) => {
+                        let at = |k: usize| (middle_of[k] - middle[k]) / half[k];
+                        let part = |k: usize| half_of[k] / half[k];
+                        powers.third([at(0), at(1)], [part(0), part(1)], centre)
+                    }
+                    None if middle_of == middle => {
+                        nets().third([pu.span_of(i), pv.span_of(j)], half, centre)
+                    }
+                    None => [f64::INFINITY; 4],
+                };
                 let ends = [pu.creases(i), pv.creases(j)];
-                let whole = Patch::new(middle, half, d, third, ends);
-                split(surface, whole, splits, &mut patches);
+                let mut first = third(middle, half, d.point);
+                if !first[0].is_finite() {
+                    first = nets().third([pu.span_of(i), pv.span_of(j)], half, d.point);
+                }
+                let whole = Patch::new(middle, half, d, first, ends);
+                split(surface, whole, splits, &third, &mut patches);
             }
         }
         let bounds = patches.iter().map(aabb);
@@ -335,6 +374,7 @@ impl Search {
     ) -> Best {
         let mut stack = [(0u32, 0.0f64); 96];
         let mut top = 1;
+        let mut left = BUDGET;
         while top > 0 {
             top -= 1;
             let (child, bound) = stack[top];
@@ -344,7 +384,7 @@ impl Search {
             if child & PATCH != 0 {
                 let patch = &self.patches[(child & !PATCH) as usize];
                 if patch.bound(p) < best.d2 {
-                    self.visit(surface, p, patch, &mut best, accept);
+                    self.visit(surface, p, patch, &mut best, (&mut left, accept));
                 }
                 continue;
             }
@@ -380,7 +420,7 @@ impl Search {
         p: DVec3,
         patch: &Patch,
         best: &mut Best,
-        accept: &impl Fn((f64, f64)) -> bool,
+        (left, accept): (&mut usize, &impl Fn((f64, f64)) -> bool),
     ) {
         let take = |uv, d2, best: &mut Best| {
             if d2 < best.d2 && accept(uv) {
@@ -412,7 +452,6 @@ impl Search {
         }
         middle(patch, best);
         let mut open: Vec<Patch> = patch.halves(surface).into();
-        let mut left = BUDGET;
         while let Some(patch) = open.pop() {
             // What rounding alone could gain is not worth a proof.
             if patch.bound(p) >= best.d2 * (1.0 - 1e-14) {
@@ -428,12 +467,12 @@ impl Search {
                 }
                 Verdict::Open => {}
             }
-            if left == 0 || patch.reach < SMALLEST * self.size {
+            if *left == 0 || patch.reach < SMALLEST * self.size {
                 let (uv, d2) = from(patch.middle);
                 take(uv, d2, best);
                 continue;
             }
-            left -= 1;
+            *left -= 1;
             middle(&patch, best);
             let [a, b] = patch.halves(surface);
             let (near, far) = if a.bound(p) < b.bound(p) {
@@ -455,43 +494,39 @@ fn descend(
     gradient: [f64; 2],
     hessian: [f64; 3],
 ) -> ((f64, f64), f64) {
+    let [hu, hv] = patch.half;
+    let place = |x: [f64; 2]| (patch.middle[0] + hu * x[0], patch.middle[1] + hv * x[1]);
     // In the patch's own parameters; the first step needs no evaluation.
-    let mut x = [0.0f64; 2];
-    let (mut g, mut h) = (gradient, hessian);
+    let mut from = [0.0f64; 2];
+    let mut x = boxed_minimum(from, gradient, hessian);
+    let mut least = patch.at.point.distance_squared(p);
     let resolution = 1e-8 * (patch.at.point.length() + p.length());
-    let mut before = f64::INFINITY;
-    for step in 0..STEPS {
-        let next = boxed_minimum(x, g, h);
-        let moved = [next[0] - x[0], next[1] - x[1]];
-        x = next;
-        let uv = (
-            patch.middle[0] + patch.half[0] * x[0],
-            patch.middle[1] + patch.half[1] * x[1],
-        );
+    for _ in 0..STEPS {
+        let uv = place(x);
         let d = surface.derivatives(uv.0, uv.1);
         let r = d.point - p;
         let d2 = r.length_squared();
-        let [hu, hv] = patch.half;
-        let way = d.du * (hu * moved[0]) + d.dv * (hv * moved[1]);
+        let way = d.du * (hu * (x[0] - from[0])) + d.dv * (hv * (x[1] - from[1]));
         // After a step this short, what is left is its square.
         if way.length_squared() <= resolution * resolution {
             return (uv, d2);
         }
-        if d2 > before && step > 0 {
-            break;
+        if d2 > least {
+            // Too far for the model: downhill lies on the way.
+            x = [0.5 * (from[0] + x[0]), 0.5 * (from[1] + x[1])];
+            continue;
         }
-        before = d2;
-        g = [d.du.dot(r) * hu, d.dv.dot(r) * hv];
-        h = [
+        least = d2;
+        from = x;
+        let g = [d.du.dot(r) * hu, d.dv.dot(r) * hv];
+        let h = [
             (d.du.length_squared() + d.duu.dot(r)) * (hu * hu),
             (d.du.dot(d.dv) + d.duv.dot(r)) * (hu * hv),
             (d.dv.length_squared() + d.dvv.dot(r)) * (hv * hv),
         ];
+        x = boxed_minimum(x, g, h);
     }
-    let start = (
-        patch.middle[0] + patch.half[0] * x[0],
-        patch.middle[1] + patch.half[1] * x[1],
-    );
+    let start = place(from);
     nearest_on_surface(|u, v| surface.derivatives(u, v), p, start, patch.ranges())
 }
 
@@ -524,13 +559,23 @@ fn boxed_minimum(x: [f64; 2], g: [f64; 2], [a, b, c]: [f64; 3]) -> [f64; 2] {
     best.1
 }
 
-fn split(surface: &NurbsSurface, patch: Patch, splits: u32, out: &mut Vec<Patch>) {
+/// Halves a patch until it is simple; `third` gives bounds over the parts.
+fn split(
+    surface: &NurbsSurface,
+    patch: Patch,
+    splits: u32,
+    third: &impl Fn([f64; 2], [f64; 2], DVec3) -> Third,
+    out: &mut Vec<Patch>,
+) {
     if splits == 0 || patch.is_simple() {
         out.push(patch);
         return;
     }
     for half in patch.halves(surface) {
-        split(surface, half, splits - 1, out);
+        let own = third(half.middle, half.half, half.at.point);
+        let mut best = half.third;
+        best.iter_mut().zip(own).for_each(|(a, b)| *a = a.min(b));
+        split(surface, half.bounded(best), splits - 1, third, out);
     }
 }
 

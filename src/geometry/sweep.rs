@@ -135,6 +135,11 @@ impl Sweep {
             (Some((_, v)), SweepPath::Around(_)) => self.downhill(p, v).0,
             (None, _) => self.search(p),
         };
+        self.across(p, t)
+    }
+
+    /// Parameters of the point of the sweep through `t` of the profile that is nearest.
+    fn across(&self, p: DVec3, t: f64) -> (f64, f64) {
         match &self.path {
             SweepPath::Along(direction) => (t, (p - self.profile.point(t)).dot(*direction)),
             SweepPath::Around(axis) => {
@@ -146,28 +151,36 @@ impl Sweep {
     }
 
     fn search(&self, p: DVec3) -> f64 {
+        let found = self.profile_minima(p).into_iter();
+        found
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .map_or(self.seeds[0], |f| f.0)
+    }
+
+    /// Parameters of every local minimum of the distance over the whole surface, some perhaps twice.
+    pub fn minima(&self, p: DVec3) -> Vec<(f64, f64)> {
+        let found = self.profile_minima(p).into_iter();
+        found.map(|(t, _)| self.across(p, t)).collect()
+    }
+
+    /// Parameters on the profile, and squared distances, reached downhill from every seed that its neighbours do not beat.
+    fn profile_minima(&self, p: DVec3) -> Vec<(f64, f64)> {
         let d2 = |i: usize| {
-            let flat = self.flat(
-                p,
-                [self.profile.point(self.seeds[i]), DVec3::ZERO, DVec3::ZERO],
-            );
-            flat[0].distance_squared(self.flat_target(p))
+            let at = [self.profile.point(self.seeds[i]), DVec3::ZERO, DVec3::ZERO];
+            self.flat(p, at)[0].distance_squared(self.flat_target(p))
         };
         let last = self.seeds.len() - 1;
-        let mut best = (self.seeds[0], f64::INFINITY);
+        let mut out = Vec::new();
         let mut before = f64::INFINITY;
         let mut here = d2(0);
         for i in 0..=last {
             let after = if i < last { d2(i + 1) } else { f64::INFINITY };
             if here <= before && here <= after {
-                let found = self.downhill(p, self.seeds[i]);
-                if found.1 < best.1 {
-                    best = found;
-                }
+                out.push(self.downhill(p, self.seeds[i]));
             }
             (before, here) = (here, after);
         }
-        best.0
+        out
     }
 
     fn downhill(&self, p: DVec3, start: f64) -> (f64, f64) {

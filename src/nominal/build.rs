@@ -51,7 +51,9 @@ pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
         b.wireframe(place);
         b.net.check_size(name)?;
     }
-    Ok(b.net.finish(name, bodies))
+    let mut nominal = b.net.finish(name, bodies);
+    nominal.pmi = super::pmi::read(&file);
+    Ok(nominal)
 }
 
 /// What a file without bodies holds instead, in words.

@@ -89,11 +89,6 @@ impl Face {
         self.trim.contains(uv)
     }
 
-    /// Whether the direction of its loops decides what is inside.
-    pub(super) fn is_oriented(&self) -> bool {
-        self.trim.is_oriented()
-    }
-
     /// In mm2.
     pub fn area_mm2(&self) -> f64 {
         self.area_mm2

@@ -35,6 +35,8 @@ struct Draft {
     id: u64,
     surface: Sensed<Surface>,
     loops: Vec<Vec<Piece>>,
+    /// Whether its loops come from the file, where they may run either way.
+    guess: bool,
 }
 
 struct Builder<'a> {
@@ -57,8 +59,16 @@ pub(super) fn build(bytes: &[u8], name: &str) -> Result<Nominal, NominalError> {
         bodies: 0,
         occurrences: 0,
     };
+    let in_figures = b.parts_of_figures();
+    // What depends on a group alone (2) stands by itself as well.
+    let stands = |e: &&Entry| match e.dependence {
+        0 => e.purpose != 2,
+        2 => matches!(e.kind, 143 | 144 | 186 | 408),
+        _ => false,
+    };
     let independent: Vec<Entry> = (file.entries().iter())
-        .filter(|e| e.dependence == 0 && e.purpose != 2)
+        .filter(stands)
+        .filter(|e| !in_figures.contains(&e.id))
         .copied()
         .collect();
     for e in &independent {
@@ -109,6 +119,16 @@ fn what_instead(file: &Iges<'_>) -> String {
 }
 
 impl Builder<'_> {
+    /// Entities that subfigure definitions (308) hold: they stand where these are used.
+    fn parts_of_figures(&self) -> BTreeSet<u64> {
+        let figures = self.file.entries().iter().filter(|e| e.kind == 308);
+        let parts = figures.filter_map(|e| {
+            let v = self.file.values(e.id).ok()?;
+            v.pointers(3, v.count(2, v.len()).ok()?).ok()
+        });
+        parts.flatten().collect()
+    }
+
     /// An entity that stands by itself, or in a subfigure.
     fn item(&mut self, e: &Entry, place: &RigidTransform, level: usize) {
         let done = match e.kind {
@@ -245,6 +265,7 @@ impl Builder<'_> {
         }
         Ok(Draft {
             id: e.id,
+            guess: e.kind == 143 || v.or_zero(1)? != 0.0,
             surface,
             loops,
         })
@@ -256,6 +277,7 @@ impl Builder<'_> {
             id,
             surface: self.shapes.surface(id)?,
             loops: self.natural_border(id)?,
+            guess: false,
         })
     }
 
@@ -558,7 +580,7 @@ impl Builder<'_> {
             let sense = Sense {
                 along: !draft.surface.reversed,
                 against: false,
-                guess: true,
+                guess: draft.guess,
             };
             let built = match failed {
                 Some(why) => Err(why),

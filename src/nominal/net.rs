@@ -18,7 +18,7 @@ const MAX_FACES: usize = 200_000;
 /// of them is used: a small file could otherwise use a large curve without end.
 const MAX_POINTS: usize = 20_000_000;
 /// Chord of the polylines that bound a face, as a share of the edge's length.
-const CHORD: f64 = 8e-6;
+const CHORD: f64 = 2e-6;
 /// Ends of edges nearer than this share of the part's size are one corner: writers round coordinates to 1e-6 of it and worse.
 const CORNER_GAP: f64 = 1e-5;
 
@@ -139,8 +139,8 @@ impl Net {
         if flipped {
             // Loops that leave the surface unbounded, or nothing of it, run the wrong way round.
             face = build(along);
-        } else if sense.guess && face.is_oriented() {
-            // Either way bounds a part of the surface: a face is rather the smaller one.
+        } else if sense.guess {
+            // Either way may bound a part of the surface: a face is rather the smaller one.
             let other = build(along);
             if other.area_mm2() > 0.0 && other.area_mm2() < 0.999 * face.area_mm2() {
                 face = other;
@@ -375,12 +375,17 @@ impl Net {
         let faces_box_mm = bounding_box(&self.faces, &self.edges);
         let size_mm = faces_box_mm[0].distance(faces_box_mm[1]);
         let corners = super::corner::corners(&sharp_edges, CORNER_GAP * size_mm);
-        let wires = self.wires.iter().flat_map(|w| {
-            let path = Path::new(w.curve.clone(), w.range);
-            path.polyline(CHORD * w.length_mm)
-        });
-        let loose = wires.map(|(_, p)| p).chain(self.loose_points);
+        let wires = self.wires.iter();
+        let wires = wires.flat_map(|w| Path::new(w.curve.clone(), w.range).extremes());
+        let loose = wires.chain(self.loose_points);
         let bounding_box_mm = loose.fold(faces_box_mm, |[low, high], p| [low.min(p), high.max(p)]);
+        let mut borders: Vec<Vec<u32>> = vec![Vec::new(); self.faces.len()];
+        for (i, e) in self.edges.iter().enumerate() {
+            for u in &e.uses {
+                borders[u.face as usize].push(i as u32);
+            }
+        }
+        let paths = self.edges.iter().map(|e| e.path.clone()).collect();
         let edges = self.edges.into_iter().map(|e| {
             let mut faces: Vec<u32> = e.uses.iter().map(|u| u.face).collect();
             faces.sort_unstable();
@@ -404,6 +409,9 @@ impl Net {
             bounding_box_mm,
             faces_box_mm,
             corners,
+            pmi: Vec::new(),
+            paths,
+            borders,
         }
     }
 }
@@ -470,11 +478,9 @@ fn bounding_box(faces: &[Face], edges: &[BuiltEdge]) -> [DVec3; 2] {
         bounds[0] = bounds[0].min(p);
         bounds[1] = bounds[1].max(p);
     };
-    edges
-        .iter()
-        .filter(|e| !e.uses.is_empty())
-        .flat_map(|e| &e.points)
-        .for_each(|p| add(*p));
+    for e in edges.iter().filter(|e| !e.uses.is_empty()) {
+        e.path.extremes().into_iter().for_each(&mut add);
+    }
     for face in faces {
         for p in super::extremes::extremes(face) {
             add(p);

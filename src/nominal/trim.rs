@@ -152,11 +152,6 @@ impl Trim {
         breaks
     }
 
-    /// Whether the direction of the loops decides what is inside.
-    pub fn is_oriented(&self) -> bool {
-        self.oriented
-    }
-
     /// Whether rays run in u.
     pub fn is_swapped(&self) -> bool {
         self.swapped
