@@ -2,11 +2,18 @@
 
 mod bodies;
 mod build;
+mod closest;
+mod corner;
 mod error;
 mod extremes;
 mod face;
+mod iges;
+mod iges_build;
+mod iges_shapes;
+mod net;
 mod part21;
 mod path;
+mod pmi;
 mod shapes;
 mod sharp;
 mod trim;
@@ -17,8 +24,10 @@ use std::path::Path;
 
 use glam::DVec3;
 
+pub use corner::{Corner, End};
 pub use error::NominalError;
 pub use face::{Face, SurfaceSample};
+pub use pmi::{Measure, Pmi, PmiKind};
 pub use sharp::{MIN_TURN_ANGLE_RAD, SharpEdge};
 
 use crate::geometry::Curve;
@@ -79,6 +88,12 @@ pub struct Nominal {
     pub bounding_box_mm: [DVec3; 2],
     /// Smallest and largest coordinates of the faces alone, mm.
     pub faces_box_mm: [DVec3; 2],
+    corners: Vec<Corner>,
+    pmi: Vec<Pmi>,
+    /// Of `edges`, by arc length.
+    paths: Vec<path::Path>,
+    /// Indices of the edges that bound each face.
+    borders: Vec<Vec<u32>>,
 }
 
 /// A bounded curve of a wireframe.
@@ -124,7 +139,7 @@ pub struct Refused {
 const MAX_BYTES: u64 = 512 << 20;
 
 impl Nominal {
-    /// The part in a STEP file (AP203, AP214, AP242).
+    /// The part in a STEP (AP203, AP214, AP242) or IGES file; the first line tells which.
     pub fn read(path: &Path) -> Result<Self, NominalError> {
         let name = path.display().to_string();
         let failed = |source| NominalError::Io {
@@ -139,7 +154,7 @@ impl Nominal {
         Self::parse(&bytes, &name)
     }
 
-    /// The part in the text of a STEP file; `name` is for messages.
+    /// The part in the text of a STEP or IGES file; `name` is for messages.
     pub fn parse(bytes: &[u8], name: &str) -> Result<Self, NominalError> {
         if bytes.len() as u64 > MAX_BYTES {
             return Err(NominalError::TooLarge {
@@ -148,7 +163,20 @@ impl Nominal {
                 limit: MAX_BYTES,
             });
         }
+        if iges::is_iges(bytes) {
+            return iges_build::build(bytes, name);
+        }
         build::build(bytes, name)
+    }
+
+    /// Where sharp edges end: corners of the part, and places where one edge goes on or fades.
+    pub fn corners(&self) -> &[Corner] {
+        &self.corners
+    }
+
+    /// Dimensions, tolerances and datum features that an AP242 file carries; empty for other files.
+    pub fn pmi(&self) -> &[Pmi] {
+        &self.pmi
     }
 
     /// Area of all faces, mm2.

@@ -1,12 +1,17 @@
 //! STEP files read as nominals, against Open CASCADE's answers and against bodies known in closed form.
 
+#[path = "nominal/closest.rs"]
+mod closest;
 #[path = "nominal/hostile.rs"]
 mod hostile;
+#[path = "nominal/iges.rs"]
+mod iges;
 
+use std::collections::BTreeSet;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
 use std::path::{Path, PathBuf};
 
-use acies::nominal::{EdgeKind, Nominal};
+use acies::nominal::{EdgeKind, End, Nominal, PmiKind};
 use glam::DVec3;
 use proptest::prelude::*;
 
@@ -77,6 +82,27 @@ fn stations_of_a_box_look_out_of_it_and_into_its_faces() {
         let (s, d) = e.nearest(middle.point + middle.normals[0] * 0.25);
         assert!((s - middle.s_mm).abs() < 1e-9 && (d - 0.25).abs() < 1e-12);
     }
+}
+
+#[test]
+fn a_box_has_eight_corners_of_three_edges_and_a_cylinder_none() {
+    let n = parse(BOX);
+    assert_eq!(n.corners().len(), 8);
+    for c in n.corners() {
+        assert!(c.is_vertex());
+        assert_eq!((c.edges.len(), c.faces.len()), (3, 3));
+        for (edge, end) in &c.edges {
+            let e = &n.sharp_edges[*edge];
+            let s_mm = if *end == End::Start { 0.0 } else { e.length_mm };
+            assert!(e.point(s_mm).distance(c.position) < 1e-12);
+            assert!(e.faces.iter().all(|f| c.faces.contains(f)));
+        }
+        let [low, high] = n.bounding_box_mm;
+        for k in 0..3 {
+            assert!(c.position[k] == low[k] || c.position[k] == high[k]);
+        }
+    }
+    assert_eq!(parse(CYLINDER).corners(), [], "its edges are rings");
 }
 
 #[test]
@@ -380,6 +406,75 @@ fn the_tessellated_file_is_refused_with_what_it_holds() {
         "no solid or surface model, but 1 tessellated solid (#11436 TESSELLATED_SOLID), 1 tessellated shell (#25216 \
          TESSELLATED_SHELL), 273 tessellated faces (#141 COMPLEX_TRIANGULATED_FACE); export the part as exact geometry \
          (boundary representation: AP203, AP214 or AP242)"
+    );
+}
+
+#[test]
+fn the_dimensions_of_a_nist_file_are_those_of_its_drawing() {
+    let Some(root) = data() else { return };
+    let path = root.join("step/nist_ftc_06_asme1_ap242-e2.stp");
+    let n = Nominal::read(&path).unwrap_or_else(|e| panic!("{e}"));
+    let count = |f: fn(&PmiKind) -> bool| n.pmi().iter().filter(|p| f(&p.kind)).count();
+    assert_eq!(
+        count(|k| matches!(k, PmiKind::Dimension { .. })),
+        24,
+        "14 sizes, 10 locations"
+    );
+    let letters: BTreeSet<&str> = n
+        .pmi()
+        .iter()
+        .filter_map(|p| match &p.kind {
+            PmiKind::DatumFeature { letter } => Some(&letter[..]),
+            _ => None,
+        })
+        .collect();
+    assert!(
+        ["A", "B", "C", "D"].iter().all(|l| letters.contains(l)),
+        "{letters:?}"
+    );
+    // #270 in the file: a radius of 0.5 inch, plus and minus 0.02 inch.
+    let radius = n.pmi().iter().find(|p| p.entity == 270).expect("a radius");
+    let PmiKind::Dimension {
+        what,
+        value,
+        deviations,
+    } = &radius.kind
+    else {
+        panic!("{radius:?}")
+    };
+    assert_eq!(what, "radius");
+    assert!((value.value() - 12.7).abs() < 1e-6);
+    let [lower, upper] = deviations.expect("limits");
+    assert!((lower + 0.508).abs() < 1e-6 && (upper - 0.508).abs() < 1e-6);
+    // #112: a position in the datum system of #330.
+    let position = n
+        .pmi()
+        .iter()
+        .find(|p| p.entity == 112)
+        .expect("a position");
+    let PmiKind::Tolerance {
+        what,
+        zone_mm,
+        datums,
+    } = &position.kind
+    else {
+        panic!("{position:?}")
+    };
+    assert_eq!(what, "position");
+    assert!(*zone_mm > 0.0 && *zone_mm < 2.0 && !datums.is_empty());
+    for p in n.pmi() {
+        assert!(
+            p.faces
+                .iter()
+                .all(|f| n.faces.iter().any(|g| g.entity == *f))
+        );
+    }
+    // Some apply to edges, points and notes.
+    let with_faces = n.pmi().iter().filter(|p| !p.faces.is_empty()).count();
+    assert!(
+        with_faces * 4 > n.pmi().len() * 3,
+        "{with_faces} of {}",
+        n.pmi().len()
     );
 }
 

@@ -217,10 +217,11 @@ pub fn start(name: &str, place: &Place, seed: u64, faults: &str) -> Result<Simul
         (_, Place::Usb(_)) => {
             return Err(refused(name, "on USB", "a pseudo-terminal or an address"));
         }
-        (_, Place::Pty(path)) => Wire::pty(path).and_then(|wire| start_on_wire(&cell, name, wire, (seed, &of_sensor))),
-        (_, Place::Tcp(address)) => {
-            Wire::tcp(*address).and_then(|wire| start_on_wire(&cell, name, wire, (seed, &of_sensor)))
+        (_, Place::Pty(path)) => {
+            Wire::pty(path).and_then(|wire| start_on_wire(&cell, name, wire, (seed, &of_sensor)))
         }
+        (_, Place::Tcp(address)) => Wire::tcp(*address)
+            .and_then(|wire| start_on_wire(&cell, name, wire, (seed, &of_sensor))),
     };
     started.map_err(|source| StartError::Port { port, source })
 }

@@ -1,6 +1,8 @@
 //! `acies nominal`: what a CAD file holds.
 
-use std::path::PathBuf;
+mod page;
+
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::Context;
@@ -8,15 +10,15 @@ use glam::DVec3;
 use serde::Serialize;
 
 use super::{Failure, Status, print_line};
-use crate::nominal::{EdgeKind, Nominal, NominalError, SharpEdge};
+use crate::nominal::{EdgeKind, Measure, Nominal, NominalError, Pmi, PmiKind, SharpEdge};
 
 /// Show faces, edges and sharp edges of a CAD file as read, and what was refused and why.
 ///
-/// Reads STEP (AP203, AP214, AP242) with exact geometry. A sharp edge is one whose two faces turn by 5 degrees or more;
-/// it carries the number of its EDGE_CURVE in the file. Lengths are in mm whatever the unit of the file.
+/// Reads STEP (AP203, AP214, AP242) and IGES with exact geometry. A sharp edge is one whose two faces turn by 5 degrees or more;
+/// it carries the number of its EDGE_CURVE in the file (IGES: of its curve in the directory). Lengths are in mm whatever the unit of the file.
 #[derive(Debug, clap::Args)]
 pub struct Nominals {
-    /// The CAD file (.stp, .step)
+    /// The CAD file (.stp, .step, .igs, .iges)
     part: PathBuf,
     /// Print one JSON object
     #[arg(long)]
@@ -24,6 +26,9 @@ pub struct Nominals {
     /// List every sharp edge
     #[arg(long)]
     edges: bool,
+    /// Write a page that shows the part and its sharp edges (.html): one file, for any browser
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
 }
 
 #[derive(Debug, Serialize)]
@@ -34,11 +39,12 @@ struct Summary {
     edges: usize,
     sharp_edges: usize,
     wires: usize,
-    bounding_box_mm: [f64; 6],
-    faces_bounding_box_mm: [f64; 6],
+    bounding_box_mm: [[f64; 3]; 2],
+    faces_bounding_box_mm: [[f64; 3]; 2],
     area_mm2: f64,
     edge_length_mm: f64,
     refused: Vec<Refusal>,
+    pmi: Vec<PmiRow>,
     seconds: f64,
     #[serde(skip_serializing_if = "Option::is_none")]
     sharp_edge_list: Option<Vec<EdgeRow>>,
@@ -48,6 +54,72 @@ struct Summary {
 struct Refusal {
     entity: u64,
     reason: String,
+}
+
+/// Semantic PMI as JSON: lengths in mm, angles in degrees.
+#[derive(Debug, Serialize)]
+struct PmiRow {
+    entity: u64,
+    #[serde(skip_serializing_if = "String::is_empty")]
+    name: String,
+    kind: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    what: Option<String>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    value: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    unit: Option<&'static str>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    deviations: Option<[f64; 2]>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    datums: Vec<String>,
+    faces: Vec<u64>,
+}
+
+impl PmiRow {
+    fn new(p: &Pmi) -> Self {
+        let mut row = Self {
+            entity: p.entity,
+            name: p.name.clone(),
+            kind: "datum_feature",
+            what: None,
+            value: None,
+            unit: None,
+            deviations: None,
+            datums: Vec::new(),
+            faces: p.faces.clone(),
+        };
+        match &p.kind {
+            PmiKind::Dimension {
+                what,
+                value,
+                deviations,
+            } => {
+                let (unit, factor) = match value {
+                    Measure::Length(_) => ("mm", 1.0),
+                    Measure::Angle(_) => ("deg", 1f64.to_degrees()),
+                };
+                row.kind = "dimension";
+                row.what = Some(what.clone());
+                row.value = Some(value.value() * factor);
+                row.unit = Some(unit);
+                row.deviations = deviations.map(|d| d.map(|x| x * factor));
+            }
+            PmiKind::Tolerance {
+                what,
+                zone_mm,
+                datums,
+            } => {
+                row.kind = "tolerance";
+                row.what = Some(what.clone());
+                row.value = Some(*zone_mm);
+                row.unit = Some("mm");
+                row.datums.clone_from(datums);
+            }
+            PmiKind::DatumFeature { letter } => row.datums.push(letter.clone()),
+        }
+        row
+    }
 }
 
 #[derive(Debug, Serialize)]
@@ -76,6 +148,9 @@ impl Nominals {
             NominalError::Io { .. } => Failure::Io(e.into()),
             _ => Failure::BadInput(e.into()),
         })?;
+        if let Some(path) = &self.output {
+            write_page(&nominal, path)?;
+        }
         let summary = summarise(&nominal, self.edges, start);
         if self.json {
             let text = serde_json::to_string(&summary)
@@ -89,8 +164,26 @@ impl Nominals {
     }
 }
 
-fn corners([low, high]: [DVec3; 2]) -> [f64; 6] {
-    [low.x, low.y, low.z, high.x, high.y, high.z]
+fn write_page(nominal: &Nominal, path: &Path) -> Result<(), Failure> {
+    if path
+        .extension()
+        .is_none_or(|e| !e.eq_ignore_ascii_case("html"))
+    {
+        return Err(Failure::Usage(anyhow::anyhow!(
+            "{}: expected a name that ends in .html",
+            path.display()
+        )));
+    }
+    let text = page::page(nominal)
+        .context("the page of the part")
+        .map_err(Failure::Internal)?;
+    std::fs::write(path, text)
+        .with_context(|| format!("{}: cannot be written", path.display()))
+        .map_err(Failure::Io)
+}
+
+fn triples(bounds: [DVec3; 2]) -> [[f64; 3]; 2] {
+    bounds.map(|p| p.to_array())
 }
 
 fn summarise(nominal: &Nominal, edges: bool, start: Instant) -> Summary {
@@ -106,11 +199,12 @@ fn summarise(nominal: &Nominal, edges: bool, start: Instant) -> Summary {
         edges: nominal.edges.len(),
         sharp_edges: nominal.sharp_edges.len(),
         wires: nominal.wires.len(),
-        bounding_box_mm: corners(nominal.bounding_box_mm),
-        faces_bounding_box_mm: corners(nominal.faces_box_mm),
+        bounding_box_mm: triples(nominal.bounding_box_mm),
+        faces_bounding_box_mm: triples(nominal.faces_box_mm),
         area_mm2: nominal.area_mm2(),
         edge_length_mm: nominal.edge_length_mm(),
         refused: refused.collect(),
+        pmi: nominal.pmi().iter().map(PmiRow::new).collect(),
         sharp_edge_list: edges.then(|| rows().collect()),
         seconds: start.elapsed().as_secs_f64(),
     }
@@ -140,7 +234,7 @@ fn row(nominal: &Nominal, edge: &SharpEdge) -> EdgeRow {
 }
 
 fn table(s: &Summary) -> String {
-    let b = &s.bounding_box_mm;
+    let [low, high] = s.bounding_box_mm;
     let mut out = vec![
         format!("part          {}", s.part),
         format!("bodies        {}", s.bodies),
@@ -149,7 +243,7 @@ fn table(s: &Summary) -> String {
         format!("sharp edges   {}", s.sharp_edges),
         format!(
             "box           {:.3} {:.3} {:.3} to {:.3} {:.3} {:.3} mm",
-            b[0], b[1], b[2], b[3], b[4], b[5]
+            low[0], low[1], low[2], high[0], high[1], high[2]
         ),
     ];
     if s.wires > 0 {

@@ -1,11 +1,17 @@
 //! Rational B-spline surfaces.
 
+use std::sync::OnceLock;
+
 use glam::{DVec3, DVec4};
+use rayon::prelude::*;
 
 use super::RigidTransform;
 use super::basis::{Basis, Knots};
+use super::nets::Powers;
 use super::newton::{Range, SurfaceDerivatives, nearest_on_surface};
 use super::nurbs_curve::{NurbsError, homogeneous};
+use super::pieces::Pieces;
+use super::search::{Best, Search};
 
 /// A rational B-spline surface of any degrees up to [`super::basis::MAX_DEGREE`], mm.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,17 +22,23 @@ pub struct NurbsSurface {
     points: Vec<DVec4>,
     rational: bool,
     closed: [bool; 2],
-    cells: Cells,
+    pieces: [Pieces; 2],
+    search: Tree,
 }
 
-/// A grid of patches of the surface, each inside a ball, for the global search.
-#[derive(Debug, Clone, PartialEq, Default)]
-struct Cells {
-    u: Vec<f64>,
-    v: Vec<f64>,
-    centres: Vec<DVec3>,
-    radii: Vec<f64>,
+/// The tree for the global search, made when it is first asked for.
+#[derive(Debug, Clone, Default)]
+struct Tree(OnceLock<Search>);
+
+impl PartialEq for Tree {
+    /// It follows from the surface: surfaces are the same with and without it.
+    fn eq(&self, _: &Self) -> bool {
+        true
+    }
 }
+
+/// Points of one block of a batch: each block is the same whatever the number of threads.
+const BLOCK: usize = 512;
 
 /// Degrees and knots (multiplicities expanded) of the two directions.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,15 +69,15 @@ impl NurbsSurface {
         }
         let (points, rational) = homogeneous(points, weights)?;
         let mut surface = Self {
+            pieces: [Pieces::new(&knots_u), Pieces::new(&knots_v)],
             knots_u,
             knots_v,
             points,
             rational,
             closed: [false; 2],
-            cells: Cells::default(),
+            search: Tree::default(),
         };
         surface.closed = surface.find_closed();
-        surface.cells = surface.search_cells();
         Ok(surface)
     }
 
@@ -121,10 +133,219 @@ impl NurbsSurface {
     /// Position and derivatives to second order at parameters, brought into the domain.
     pub fn derivatives(&self, u: f64, v: f64) -> SurfaceDerivatives {
         let (u, v) = self.bring(u, v);
-        let (su, sv) = (self.knots_u.span(u), self.knots_v.span(v));
-        let nu = self.knots_u.derivatives(su, u);
-        let nv = self.knots_v.derivatives(sv, v);
-        let [s, du, dv, duu, duv, dvv] = self.sums(su, sv, &nu, &nv);
+        let sums = match (self.knots_u.degree(), self.knots_v.degree()) {
+            (1, 1) => self.second_sums::<2, 2>(u, v),
+            (2, 2) => self.second_sums::<3, 3>(u, v),
+            (3, 3) => self.second_sums::<4, 4>(u, v),
+            (3, 1) => self.second_sums::<4, 2>(u, v),
+            (1, 3) => self.second_sums::<2, 4>(u, v),
+            (5, 5) => self.second_sums::<6, 6>(u, v),
+            _ => {
+                let (su, sv) = (self.knots_u.span(u), self.knots_v.span(v));
+                let nu = self.knots_u.derivatives(su, u);
+                let nv = self.knots_v.derivatives(sv, v);
+                self.sums(su, sv, &nu, &nv)
+            }
+        };
+        self.quotient(sums)
+    }
+
+    /// Position and derivatives by u and v at parameters, brought into the domain.
+    pub fn first_derivatives(&self, u: f64, v: f64) -> [DVec3; 3] {
+        let (u, v) = self.bring(u, v);
+        let [s, du, dv] = match (self.knots_u.degree(), self.knots_v.degree()) {
+            (1, 1) => self.first_sums::<2, 2>(u, v),
+            (2, 2) => self.first_sums::<3, 3>(u, v),
+            (3, 3) => self.first_sums::<4, 4>(u, v),
+            (3, 1) => self.first_sums::<4, 2>(u, v),
+            (1, 3) => self.first_sums::<2, 4>(u, v),
+            (5, 5) => self.first_sums::<6, 6>(u, v),
+            _ => {
+                let d = self.derivatives(u, v);
+                return [d.point, d.du, d.dv];
+            }
+        };
+        if !self.rational {
+            return [s.truncate(), du.truncate(), dv.truncate()];
+        }
+        let w = s.w.recip();
+        let point = s.truncate() * w;
+        [
+            point,
+            (du.truncate() - point * du.w) * w,
+            (dv.truncate() - point * dv.w) * w,
+        ]
+    }
+
+    /// [`Self::first_derivatives`] of many places, on all cores.
+    pub fn first_derivatives_of(&self, places: &[(f64, f64)]) -> Vec<[DVec3; 3]> {
+        let of = |(u, v): &(f64, f64)| self.first_derivatives(*u, *v);
+        places.par_iter().with_min_len(BLOCK).map(of).collect()
+    }
+
+    /// Parameters of the nearest point and its distance: from the hint alone, or of the whole surface without one.
+    ///
+    /// Without a hint the answer is the global minimum, proved by bounds on every part of the surface.
+    pub fn nearest(&self, p: DVec3, near: Option<(f64, f64)>) -> ((f64, f64), f64) {
+        if let Some(uv) = near {
+            let (uv, d2) = self.downhill(p, uv);
+            return (uv, d2.sqrt());
+        }
+        let best = self.search(p, Best::NONE, &|_| true);
+        (best.uv, best.d2.sqrt())
+    }
+
+    /// The nearest of the minima that are accepted and nearer than `limit_mm`: parameters and distance.
+    pub fn nearest_where(
+        &self,
+        p: DVec3,
+        limit_mm: f64,
+        accept: impl Fn((f64, f64)) -> bool,
+    ) -> Option<((f64, f64), f64)> {
+        let limit = Best {
+            d2: limit_mm * limit_mm,
+            ..Best::NONE
+        };
+        let best = self.search(p, limit, &accept);
+        (best.d2 < limit.d2).then(|| (best.uv, best.d2.sqrt()))
+    }
+
+    /// [`Self::nearest`] of many points, on all cores. Each search begins at the foot of the point before: points in the
+    /// order of a scan are faster, those in any order are no less sure.
+    pub fn nearest_of(&self, points: &[DVec3]) -> Vec<((f64, f64), f64)> {
+        let block = |points: &[DVec3]| {
+            let mut last: Option<(f64, f64)> = None;
+            let found: Vec<_> = points
+                .iter()
+                .map(|p| {
+                    let start = last.map_or(Best::NONE, |uv| {
+                        let (uv, d2) = self.downhill(*p, uv);
+                        Best { uv, d2 }
+                    });
+                    let best = self.search(*p, start, &|_| true);
+                    last = Some(best.uv);
+                    (best.uv, best.d2.sqrt())
+                })
+                .collect();
+            found
+        };
+        points.par_chunks(BLOCK).flat_map_iter(block).collect()
+    }
+
+    fn downhill(&self, p: DVec3, from: (f64, f64)) -> ((f64, f64), f64) {
+        nearest_on_surface(|u, v| self.derivatives(u, v), p, from, self.ranges())
+    }
+
+    fn search(&self, p: DVec3, best: Best, accept: &impl Fn((f64, f64)) -> bool) -> Best {
+        if !p.is_finite() {
+            return best;
+        }
+        let tree = self.search.0.get_or_init(|| Search::new(self));
+        tree.nearest(self, p, best, accept)
+    }
+
+    /// Control points times weight, and the weight, v running fastest.
+    pub(super) fn homogeneous(&self) -> &[DVec4] {
+        &self.points
+    }
+
+    pub(super) fn is_rational(&self) -> bool {
+        self.rational
+    }
+
+    /// One polynomial piece in powers; `None` where a degree is too high for that.
+    pub(super) fn powers(&self, i: usize, j: usize) -> Option<Powers> {
+        let [pu, pv] = self.pieces();
+        let (cu, cv) = (pu.coefficients(i), pv.coefficients(j));
+        if cu.is_empty() || cv.is_empty() {
+            return None;
+        }
+        let (n, m) = (self.knots_u.degree() + 1, self.knots_v.degree() + 1);
+        let (u, v) = (pu.span_of(i) + 1 - n, pv.span_of(j) + 1 - m);
+        let side = super::pieces::MAX_DEGREE + 1;
+        let mut out = [DVec4::ZERO; 36];
+        for k in 0..n {
+            let row = &self.points[(u + k) * self.knots_v.points() + v..][..m];
+            for b in 0..m {
+                let across = (row.iter().zip(&cv[b * m..])).map(|(p, c)| *p * *c);
+                let across: DVec4 = across.sum();
+                for a in 0..n {
+                    out[a * side + b] += across * cu[a * n + k];
+                }
+            }
+        }
+        Some(Powers::new(out, self.rational))
+    }
+
+    pub(super) fn pieces(&self) -> [&Pieces; 2] {
+        [&self.pieces[0], &self.pieces[1]]
+    }
+
+    /// The surface moved.
+    pub fn transformed(&self, by: &RigidTransform) -> Self {
+        let mut moved = self.clone();
+        for p in &mut moved.points {
+            *p = (by.rotation * p.truncate() + by.translation * p.w).extend(p.w);
+        }
+        moved.search = Tree::default();
+        moved
+    }
+
+    #[inline]
+    fn bring(&self, u: f64, v: f64) -> (f64, f64) {
+        let [ru, rv] = self.ranges();
+        (ru.bring(u), rv.bring(v))
+    }
+
+    /// Homogeneous sums of S, Su, Sv for degrees N - 1 and M - 1.
+    #[inline]
+    fn first_sums<const N: usize, const M: usize>(&self, u: f64, v: f64) -> [DVec4; 3] {
+        let (iu, [nu, du]) = self.pieces[0].first::<N>(u);
+        let (iv, [nv, dv]) = self.pieces[1].first::<M>(v);
+        let stride = self.knots_v.points();
+        let mut out = [DVec4::ZERO; 3];
+        for i in 0..N {
+            let row = &self.points[(iu + i) * stride + iv..][..M];
+            let (mut a, mut da) = (DVec4::ZERO, DVec4::ZERO);
+            for j in 0..M {
+                a += row[j] * nv[j];
+                da += row[j] * dv[j];
+            }
+            out[0] += a * nu[i];
+            out[1] += a * du[i];
+            out[2] += da * nu[i];
+        }
+        out
+    }
+
+    /// Homogeneous sums of S, Su, Sv, Suu, Suv, Svv for degrees N - 1 and M - 1.
+    #[inline]
+    fn second_sums<const N: usize, const M: usize>(&self, u: f64, v: f64) -> [DVec4; 6] {
+        let (iu, [nu, du, ddu]) = self.pieces[0].second::<N>(u);
+        let (iv, [nv, dv, ddv]) = self.pieces[1].second::<M>(v);
+        let stride = self.knots_v.points();
+        let mut out = [DVec4::ZERO; 6];
+        for i in 0..N {
+            let row = &self.points[(iu + i) * stride + iv..][..M];
+            let (mut a, mut da, mut dda) = (DVec4::ZERO, DVec4::ZERO, DVec4::ZERO);
+            for j in 0..M {
+                a += row[j] * nv[j];
+                da += row[j] * dv[j];
+                dda += row[j] * ddv[j];
+            }
+            out[0] += a * nu[i];
+            out[1] += a * du[i];
+            out[2] += da * nu[i];
+            out[3] += a * ddu[i];
+            out[4] += da * du[i];
+            out[5] += dda * nu[i];
+        }
+        out
+    }
+
+    /// Derivatives from their homogeneous sums (The NURBS Book, equation 4.20).
+    #[inline]
+    fn quotient(&self, [s, du, dv, duu, duv, dvv]: [DVec4; 6]) -> SurfaceDerivatives {
         if !self.rational {
             return SurfaceDerivatives {
                 point: s.truncate(),
@@ -135,7 +356,6 @@ impl NurbsSurface {
                 dvv: dvv.truncate(),
             };
         }
-        // Derivatives of the quotient (The NURBS Book, equation 4.20).
         let w = s.w.recip();
         let point = s.truncate() * w;
         let p_u = (du.truncate() - point * du.w) * w;
@@ -148,57 +368,6 @@ impl NurbsSurface {
             duv: (duv.truncate() - p_u * dv.w - p_v * du.w - point * duv.w) * w,
             dvv: (dvv.truncate() - p_v * (2.0 * dv.w) - point * dvv.w) * w,
         }
-    }
-
-    /// Parameters of the nearest point and its distance: from the hint alone, or over the whole surface without one.
-    pub fn nearest(&self, p: DVec3, near: Option<(f64, f64)>) -> ((f64, f64), f64) {
-        let ranges = self.ranges();
-        let refine = |uv| nearest_on_surface(|u, v| self.derivatives(u, v), p, uv, ranges);
-        if let Some(uv) = near {
-            let (uv, d2) = refine(uv);
-            return (uv, d2.sqrt());
-        }
-        let cells = &self.cells;
-        let d2 = |i: usize| cells.centres[i].distance_squared(p);
-        let mut first = (0, d2(0));
-        for i in 1..cells.centres.len() {
-            let d = d2(i);
-            if d < first.1 {
-                first = (i, d);
-            }
-        }
-        let mut best = refine(cells.uv(first.0));
-        let mut reach = best.1.sqrt();
-        for i in 0..cells.centres.len() {
-            let bound = reach + cells.radii[i];
-            let d = d2(i);
-            if d < bound * bound && i != first.0 {
-                let found = refine(cells.uv(i));
-                if found.1 < best.1 {
-                    best = found;
-                    reach = best.1.sqrt();
-                }
-            }
-        }
-        (best.0, reach)
-    }
-
-    /// The surface moved.
-    pub fn transformed(&self, by: &RigidTransform) -> Self {
-        let mut moved = self.clone();
-        for p in &mut moved.points {
-            *p = (by.rotation * p.truncate() + by.translation * p.w).extend(p.w);
-        }
-        for c in &mut moved.cells.centres {
-            *c = by.point(*c);
-        }
-        moved
-    }
-
-    #[inline]
-    fn bring(&self, u: f64, v: f64) -> (f64, f64) {
-        let [ru, rv] = self.ranges();
-        (ru.bring(u), rv.bring(v))
     }
 
     /// Homogeneous sums of S, Su, Sv, Suu, Suv, Svv.
@@ -251,57 +420,6 @@ impl NurbsSurface {
         }
         // Writers round coordinates to 1e-7 of the size and worse.
         gap.map(|g| g <= 1e-6 * size)
-    }
-
-    fn search_cells(&self) -> Cells {
-        let nodes = |k: &Knots| {
-            let breaks = k.breaks();
-            let spans = breaks.len() - 1;
-            let pieces = if k.degree() == 1 && spans > 2 {
-                1
-            } else {
-                (8usize).div_ceil(spans).max(2)
-            };
-            let mut nodes = Vec::with_capacity(2 * pieces * spans + 1);
-            for w in breaks.windows(2) {
-                // Two steps a cell: border, middle.
-                nodes.extend(
-                    (0..2 * pieces).map(|i| w[0] + (w[1] - w[0]) * i as f64 / (2 * pieces) as f64),
-                );
-            }
-            nodes.push(breaks[spans]);
-            nodes
-        };
-        let (nu, nv) = (nodes(&self.knots_u), nodes(&self.knots_v));
-        let mut rows: Vec<Vec<DVec3>> = Vec::with_capacity(nu.len());
-        for u in &nu {
-            rows.push(nv.iter().map(|v| self.point(*u, *v)).collect());
-        }
-        let mut cells = Cells {
-            u: nu.iter().copied().skip(1).step_by(2).collect(),
-            v: nv.iter().copied().skip(1).step_by(2).collect(),
-            ..Cells::default()
-        };
-        for i in 0..cells.u.len() {
-            for j in 0..cells.v.len() {
-                let centre = rows[2 * i + 1][2 * j + 1];
-                let radius = rows[2 * i..=2 * i + 2]
-                    .iter()
-                    .flat_map(|row| &row[2 * j..=2 * j + 2])
-                    .map(|p| p.distance(centre))
-                    .fold(0.0, f64::max);
-                cells.centres.push(centre);
-                // A cell spans a part of one polynomial piece: between its nine samples it bulges by less than a quarter.
-                cells.radii.push(1.25 * radius);
-            }
-        }
-        cells
-    }
-}
-
-impl Cells {
-    fn uv(&self, i: usize) -> (f64, f64) {
-        (self.u[i / self.v.len()], self.v[i % self.v.len()])
     }
 }
 

@@ -9,14 +9,14 @@ use super::{Curve, Frame, RigidTransform};
 #[derive(Debug, Clone, PartialEq)]
 pub struct Sweep {
     profile: Curve,
-    path: Path,
+    path: SweepPath,
     /// Parameters of the profile, dense enough that each minimum of the distance has one beside it.
     seeds: Vec<f64>,
 }
 
 /// The motion of the profile.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Path {
+pub enum SweepPath {
     /// Along a unit vector: u is the profile's parameter, v the way in mm.
     Along(DVec3),
     /// Around z of a frame: u is the angle, v the profile's parameter.
@@ -27,15 +27,15 @@ impl Sweep {
     /// The surface of a profile moved along `direction`; `None` where that has no direction or the profile no end.
     pub fn along(profile: Curve, direction: DVec3) -> Option<Self> {
         let direction = direction.try_normalize()?;
-        Self::new(profile, Path::Along(direction))
+        Self::new(profile, SweepPath::Along(direction))
     }
 
     /// The surface of a profile turned about z of `axis`; `None` where the profile has no end.
     pub fn around(profile: Curve, axis: Frame) -> Option<Self> {
-        Self::new(profile, Path::Around(axis))
+        Self::new(profile, SweepPath::Around(axis))
     }
 
-    fn new(profile: Curve, path: Path) -> Option<Self> {
+    fn new(profile: Curve, path: SweepPath) -> Option<Self> {
         let range = profile.range();
         if !(range.from.is_finite() && range.to.is_finite()) {
             return None;
@@ -66,26 +66,31 @@ impl Sweep {
         &self.profile
     }
 
+    /// How it is moved.
+    pub fn path(&self) -> &SweepPath {
+        &self.path
+    }
+
     /// The word of ISO 10303-42.
     pub fn kind(&self) -> &'static str {
         match self.path {
-            Path::Along(_) => "surface_of_linear_extrusion",
-            Path::Around(_) => "surface_of_revolution",
+            SweepPath::Along(_) => "surface_of_linear_extrusion",
+            SweepPath::Around(_) => "surface_of_revolution",
         }
     }
 
     /// Ranges of u and v.
     pub fn ranges(&self) -> [Range; 2] {
         match self.path {
-            Path::Along(_) => [self.profile.range(), Range::UNBOUNDED],
-            Path::Around(_) => [Range::TURN, self.profile.range()],
+            SweepPath::Along(_) => [self.profile.range(), Range::UNBOUNDED],
+            SweepPath::Around(_) => [Range::TURN, self.profile.range()],
         }
     }
 
     /// Position and derivatives to second order.
     pub fn derivatives(&self, u: f64, v: f64) -> SurfaceDerivatives {
         match &self.path {
-            Path::Along(direction) => {
+            SweepPath::Along(direction) => {
                 let [c, dc, ddc] = self.profile.derivatives(u);
                 SurfaceDerivatives {
                     point: c + *direction * v,
@@ -96,7 +101,7 @@ impl Sweep {
                     dvv: DVec3::ZERO,
                 }
             }
-            Path::Around(axis) => {
+            SweepPath::Around(axis) => {
                 let [c, dc, ddc] = self.profile.derivatives(v);
                 let (s, k) = u.sin_cos();
                 // A vector turned by u, and the derivatives of that by u.
@@ -126,13 +131,18 @@ impl Sweep {
     /// Parameters of the nearest point: a search over the profile alone, in the plane that the sweep leaves.
     pub fn nearest(&self, p: DVec3, near: Option<(f64, f64)>) -> (f64, f64) {
         let t = match (near, &self.path) {
-            (Some((u, _)), Path::Along(_)) => self.downhill(p, u).0,
-            (Some((_, v)), Path::Around(_)) => self.downhill(p, v).0,
+            (Some((u, _)), SweepPath::Along(_)) => self.downhill(p, u).0,
+            (Some((_, v)), SweepPath::Around(_)) => self.downhill(p, v).0,
             (None, _) => self.search(p),
         };
+        self.across(p, t)
+    }
+
+    /// Parameters of the point of the sweep through `t` of the profile that is nearest.
+    fn across(&self, p: DVec3, t: f64) -> (f64, f64) {
         match &self.path {
-            Path::Along(direction) => (t, (p - self.profile.point(t)).dot(*direction)),
-            Path::Around(axis) => {
+            SweepPath::Along(direction) => (t, (p - self.profile.point(t)).dot(*direction)),
+            SweepPath::Around(axis) => {
                 let of = |q: DVec3| Frame::angle_of(axis.local(q).truncate());
                 let u = of(p) - of(self.profile.point(t));
                 (Range::TURN.bring(u), t)
@@ -141,28 +151,36 @@ impl Sweep {
     }
 
     fn search(&self, p: DVec3) -> f64 {
+        let found = self.profile_minima(p).into_iter();
+        found
+            .min_by(|a, b| a.1.total_cmp(&b.1))
+            .map_or(self.seeds[0], |f| f.0)
+    }
+
+    /// Parameters of every local minimum of the distance over the whole surface, some perhaps twice.
+    pub fn minima(&self, p: DVec3) -> Vec<(f64, f64)> {
+        let found = self.profile_minima(p).into_iter();
+        found.map(|(t, _)| self.across(p, t)).collect()
+    }
+
+    /// Parameters on the profile, and squared distances, reached downhill from every seed that its neighbours do not beat.
+    fn profile_minima(&self, p: DVec3) -> Vec<(f64, f64)> {
         let d2 = |i: usize| {
-            let flat = self.flat(
-                p,
-                [self.profile.point(self.seeds[i]), DVec3::ZERO, DVec3::ZERO],
-            );
-            flat[0].distance_squared(self.flat_target(p))
+            let at = [self.profile.point(self.seeds[i]), DVec3::ZERO, DVec3::ZERO];
+            self.flat(p, at)[0].distance_squared(self.flat_target(p))
         };
         let last = self.seeds.len() - 1;
-        let mut best = (self.seeds[0], f64::INFINITY);
+        let mut out = Vec::new();
         let mut before = f64::INFINITY;
         let mut here = d2(0);
         for i in 0..=last {
             let after = if i < last { d2(i + 1) } else { f64::INFINITY };
             if here <= before && here <= after {
-                let found = self.downhill(p, self.seeds[i]);
-                if found.1 < best.1 {
-                    best = found;
-                }
+                out.push(self.downhill(p, self.seeds[i]));
             }
             (before, here) = (here, after);
         }
-        best.0
+        out
     }
 
     fn downhill(&self, p: DVec3, start: f64) -> (f64, f64) {
@@ -173,8 +191,8 @@ impl Sweep {
     /// Where the point lies in the plane of the search.
     fn flat_target(&self, p: DVec3) -> DVec3 {
         match &self.path {
-            Path::Along(_) => DVec3::ZERO,
-            Path::Around(axis) => {
+            SweepPath::Along(_) => DVec3::ZERO,
+            SweepPath::Around(axis) => {
                 let l = axis.local(p);
                 DVec3::new(l.truncate().length(), l.z, 0.0)
             }
@@ -184,8 +202,10 @@ impl Sweep {
     /// Profile and derivatives seen along the sweep: from the point, across the direction; or as radius and height.
     fn flat(&self, p: DVec3, [c, dc, ddc]: [DVec3; 3]) -> [DVec3; 3] {
         match &self.path {
-            Path::Along(direction) => [c - p, dc, ddc].map(|d| d - *direction * d.dot(*direction)),
-            Path::Around(axis) => {
+            SweepPath::Along(direction) => {
+                [c - p, dc, ddc].map(|d| d - *direction * d.dot(*direction))
+            }
+            SweepPath::Around(axis) => {
                 let l = axis.local(c);
                 let radial = l.truncate();
                 let d = DVec2::new(dc.dot(axis.x), dc.dot(axis.y));
@@ -207,8 +227,8 @@ impl Sweep {
         Self {
             profile: self.profile.transformed(by),
             path: match self.path {
-                Path::Along(d) => Path::Along(by.vector(d)),
-                Path::Around(f) => Path::Around(f.transformed(by)),
+                SweepPath::Along(d) => SweepPath::Along(by.vector(d)),
+                SweepPath::Around(f) => SweepPath::Around(f.transformed(by)),
             },
             seeds: self.seeds.clone(),
         }

@@ -414,7 +414,7 @@ fn units_of_context(file: &Part21, context: u64) -> Read<Units> {
 }
 
 /// Factor from a unit to metre or radian.
-fn si_factor(file: &Part21, unit: u64, depth: usize) -> Read<f64> {
+pub(super) fn si_factor(file: &Part21, unit: u64, depth: usize) -> Read<f64> {
     if depth > 8 {
         return Err(refuse(unit, "a unit defined by itself"));
     }

@@ -59,6 +59,16 @@ pub enum NominalError {
         /// Line, column, what was seen and expected.
         what: String,
     },
+    /// The sections of an IGES file are broken.
+    #[error("{name}: line {line}: {what}; export the part again")]
+    Iges {
+        /// File.
+        name: String,
+        /// Line of the file, from 1.
+        line: usize,
+        /// What was seen and expected.
+        what: String,
+    },
     /// The file holds no boundary representation.
     #[error(
         "{name}: no solid or surface model, but {found}; export the part as exact geometry (boundary representation: AP203, AP214 or AP242)"

@@ -342,6 +342,14 @@ impl<'a> Record<'a> {
         }
     }
 
+    /// A string; empty where it is none.
+    pub fn text(&self, i: usize) -> String {
+        match self.attribute(i) {
+            Ok(Attribute::String(s)) => s.clone(),
+            _ => String::new(),
+        }
+    }
+
     /// The word between dots, or nothing.
     pub fn word(&self, i: usize) -> Option<&'a str> {
         match self.attribute(i) {

@@ -154,6 +154,34 @@ impl Path {
         (self.arc_length_mm(best.0), best.1.sqrt())
     }
 
+    /// Its ends, and its outermost points along each axis.
+    pub fn extremes(&self) -> Vec<DVec3> {
+        let mut out = vec![self.nodes[0].point, self.nodes[self.nodes.len() - 1].point];
+        if let Curve::Line { .. } = self.curve {
+            return out;
+        }
+        for w in self.nodes.windows(2) {
+            let (a, b) = (w[0].t, w[1].t);
+            let speed = |t: f64| self.curve.derivatives(t)[1];
+            let (da, db) = (speed(a), speed(b));
+            out.push(w[1].point);
+            for k in (0..3).filter(|k| da[*k] * db[*k] < 0.0) {
+                // Between two nodes the coordinate turns once: halve until rounding.
+                let (mut low, mut high) = (a, b);
+                for _ in 0..50 {
+                    let middle = 0.5 * (low + high);
+                    if speed(middle)[k] * da[k] > 0.0 {
+                        low = middle;
+                    } else {
+                        high = middle;
+                    }
+                }
+                out.push(self.curve.point(low));
+            }
+        }
+        out
+    }
+
     /// Parameters and points along the path, at most `chord_mm` beside it between two of them.
     pub fn polyline(&self, chord_mm: f64) -> Vec<(f64, DVec3)> {
         let mut out = vec![(self.nodes[0].t, self.nodes[0].point)];

@@ -16,7 +16,7 @@ pub(super) struct Sensed<T> {
 }
 
 impl<T> Sensed<T> {
-    fn plain(shape: T) -> Self {
+    pub fn plain(shape: T) -> Self {
         Self {
             shape,
             reversed: false,
@@ -509,7 +509,7 @@ fn faced(shape: Surface, point: DVec3, normal: DVec3, reversed: bool) -> Sensed<
     }
 }
 
-fn extruded(id: u64, profile: Sensed<Curve>, along: DVec3) -> Read<Sensed<Surface>> {
+pub(super) fn extruded(id: u64, profile: Sensed<Curve>, along: DVec3) -> Read<Sensed<Surface>> {
     let [at, tangent, _] = profile.shape.derivatives(0.0);
     let bad = || refuse(id, "an extrusion along its own profile");
     match &profile.shape {
@@ -538,7 +538,7 @@ fn extruded(id: u64, profile: Sensed<Curve>, along: DVec3) -> Read<Sensed<Surfac
     }
 }
 
-fn revolved(id: u64, profile: Sensed<Curve>, axis: Frame) -> Read<Sensed<Surface>> {
+pub(super) fn revolved(id: u64, profile: Sensed<Curve>, axis: Frame) -> Read<Sensed<Surface>> {
     let analytic = match &profile.shape {
         Curve::Line { origin, direction } => {
             Some(revolved_line(*origin, *direction, axis).ok_or_else(|| {
@@ -641,7 +641,7 @@ fn revolved_circle(circle: &Frame, radius_mm: f64, axis: Frame) -> Option<Surfac
     })
 }
 
-fn offset(id: u64, basis: Surface, distance_mm: f64) -> Result<Surface, Refused> {
+pub(super) fn offset(id: u64, basis: Surface, distance_mm: f64) -> Result<Surface, Refused> {
     let grown = |r: f64| {
         if r + distance_mm > 0.0 {
             Ok(r + distance_mm)
