@@ -570,6 +570,7 @@ fn honesty(seeds: u64) {
             &AlignOptions {
                 datum_faces: &[1, 2, 3],
                 touches: &[],
+                ..AlignOptions::default()
             },
         );
         if aligned.alignment.status != acies::inspect::result::Verdict::Ok {
