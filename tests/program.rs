@@ -361,7 +361,7 @@ fn devices_and_check_answer_in_json() {
         "{told}"
     );
     assert!(
-        told.contains("edge: Entity(7), expected a sharp edge of the nominal"),
+        told.contains("edge: #7, expected a sharp edge of the nominal"),
         "{told}"
     );
     assert_eq!(status(&acies(&["chekc"])), 64);

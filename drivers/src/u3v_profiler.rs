@@ -7,7 +7,8 @@
 //! # Configuration
 //!
 //! ```toml
-//! usb_serial = "SN-1"            # USB serial number; or usb_id = "1ab2:0001"; without both, the only device of this kind
+//! usb_serial = "SN-1"            # USB serial number; without it and the next, the only device of this kind
+//! # usb_id = "1ab2:0001"         # instead: vendor and product number
 //! serial_number = "SN-1"         # in the device's own registers: another one is refused
 //! features = [                   # GenICam features that are set at opening, in this order
 //!     ["PixelFormat", "Coord3D_C16"],

@@ -246,6 +246,54 @@ fn nothing_is_decided_outside_the_temperatures_of_the_recipe_or_without_one() {
     assert_eq!(verdict(None), (Verdict::NotDecidable, true));
 }
 
+/// The edge point of the published QIF 3.0 results sample (qif-community, `QIF_Results_Sample.QIF`, features 9 to 17): what its
+/// writer states is the component of the deviation along the normal of the edge's face.
+#[test]
+fn d_along_the_normal_is_what_the_qif_sample_states() {
+    use acies::inspect::flank::FlankFit;
+    use acies::inspect::virtual_edge::intersect;
+    use acies::nominal::{EdgeKind, Station};
+
+    let point = DVec3::new(2460.7099609375, 770.604614257813, 944.993591308594);
+    let normal = DVec3::new(-0.735465884156764, -0.307902932144901, 0.603560864882807);
+    let adjacent = DVec3::new(0.0411800179070127, -0.909449806293281, -0.413769568671128);
+    let measured = DVec3::new(2460.72, 770.62, 944.98);
+    let stated = -0.020323885079998;
+
+    let normals = [normal, adjacent];
+    let tangent = normal.cross(adjacent).normalize();
+    let station = Station {
+        s_mm: 0.0,
+        point,
+        tangent,
+        normals,
+        into_face: [-tangent.cross(normal), tangent.cross(adjacent)],
+    };
+    // Two flanks parallel to their faces, through the measured point.
+    let flank = |n: DVec3| FlankFit {
+        offset_mm: (measured - point).dot(n),
+        tilt: 0.0,
+        slope: 0.0,
+        bend: 0.0,
+        covariance: [[0.0; 2]; 2],
+        sigma_mm: 0.0,
+        points: 100,
+        cut_mm: 0.0,
+        lack_of_fit: false,
+    };
+    let flanks = normals.map(flank);
+    let edge = intersect(
+        &station,
+        EdgeKind::Convex,
+        [&flanks[0], &flanks[1]],
+        |_, _| 0.0,
+    );
+    let edge = edge.expect("two faces at 82 degrees");
+    // The sample prints 15 decimals of a difference of numbers near 2460, which are good to 4.5e-13.
+    assert!((edge.d_mm[0] - stated).abs() < 1e-12, "{}", edge.d_mm[0]);
+    assert!((edge.d_mm[1] + 0.007_955).abs() < 1e-6, "{}", edge.d_mm[1]);
+}
+
 /// A face that is off and tilted moves a straight edge as a whole: a line profile, no form, and the direction of the tilt.
 #[test]
 fn form_along_an_edge_is_apart_from_its_place() {

@@ -5,7 +5,8 @@
 //! an error of the opening, tried again like any other.
 //!
 //! A read is one transfer into one buffer. libusb cuts it into pieces of 16 KiB or more that are all queued in the kernel at once, so that a large read
-//! keeps several in flight; between two reads the device holds what it has, and `benches/network.rs` measures how long that is.
+//! keeps several in flight; between two reads the device holds what it has, and
+//! how long a real one must hold it has not been measured.
 
 use std::fmt;
 use std::sync::Arc;
