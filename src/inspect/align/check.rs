@@ -12,9 +12,13 @@ use crate::inspect::body::Body;
 use crate::inspect::measure::pose_row;
 use crate::inspect::result::Verdict;
 
-/// Share of the points near the nominal that must lie on it; the rest may be burrs, reflections, the foot of a clamp. Of another part that
-/// lies as well as it can some 94 to 96 per cent do.
-const ON_NOMINAL: f64 = 0.97;
+/// Share of the points near the nominal that must lie on it; the rest may be burrs, reflections, the foot of a clamp, and places so narrow
+/// that their normal is that of no face.
+const ON_NOMINAL: f64 = 0.9;
+
+/// Share of the points within the nominal's box that may lie far from every face: what holds the part stands outside of it, so that surfaces
+/// where the nominal has material, or nothing, are those of another part.
+const STRAY: f64 = 0.1;
 
 /// Share of the half-diagonal that a face of the right part may be off: 0.2 mm of a part of 10 mm. What lies on a face of its direction and
 /// further off was not made by shifting a face.
@@ -80,6 +84,15 @@ impl<B: Body> Task<'_, B> {
             let finding = format!(
                 "alignment: only {} of {total} points lie near the nominal, expected more than half; check part and start",
                 fit.near
+            );
+            return Some((Conclusion::Misfit, finding));
+        }
+        let within = fit.near + fit.stray;
+        if fit.stray as f64 > STRAY * within as f64 {
+            let finding = format!(
+                "alignment: {:.0} % of the points within the nominal's box lie far from every face, expected at most {:.0} %; check part and start",
+                100.0 * fit.stray as f64 / within as f64,
+                100.0 * STRAY
             );
             return Some((Conclusion::Misfit, finding));
         }

@@ -110,7 +110,8 @@ impl Scene {
         cap_mm: f64,
     ) -> Fit {
         let turn = DMat3::from_quat(pose.rotation);
-        let places: Vec<(bool, f64)> = self
+        let [low, high] = surface.body.bounds();
+        let places: Vec<(bool, f64, bool)> = self
             .points
             .par_iter()
             .with_min_len(64)
@@ -131,6 +132,7 @@ impl Scene {
                     } else {
                         cap_mm
                     },
+                    !near && p.cmpgt(low).all() && p.cmplt(high).all(),
                 )
             })
             .collect();
@@ -139,6 +141,7 @@ impl Scene {
         Fit {
             rms_mm: (squares / distances.len().max(1) as f64).sqrt(),
             near: places.iter().filter(|p| p.0).count(),
+            stray: places.iter().filter(|p| p.2).count(),
             distances,
         }
     }
@@ -153,6 +156,8 @@ pub(super) struct Fit {
     pub(super) rms_mm: f64,
     /// Points within the cap of any face.
     pub(super) near: usize,
+    /// Points farther than the cap from every face, and yet within the nominal's box.
+    pub(super) stray: usize,
 }
 
 impl Fit {
