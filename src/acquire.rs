@@ -17,7 +17,7 @@ use crate::geometry::RigidTransform;
 use crate::points::PointCloud;
 
 pub use assembler::Assembler;
-pub use run::{Profiling, ScanError, ScanEvent, ScanPlan, scan};
+pub use run::{Profiling, ScanError, ScanEvent, ScanPlan, ScanWatch, scan};
 
 /// Where a profiler is, and how it moves relative to the part.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -15,6 +15,7 @@ mod progress;
 mod reconstruct;
 mod record;
 mod replay;
+mod serve;
 mod simulate;
 
 use std::process::ExitCode;
@@ -30,6 +31,8 @@ use crate::web;
 pub enum Command {
     /// Play a simulated cell: scan a part with known defects, measure its edges, report.
     Demo(demo::Demo),
+    /// Run a cell: the daemon with its page and API.
+    Serve(serve::Serve),
     /// Measure every sharp edge of a scan against its nominal.
     Inspect(inspect::Inspect),
     /// Find the points of a scan that lie on sharp edges, corners and boundaries.
@@ -66,6 +69,7 @@ impl Command {
     pub fn run(self) -> Result<Status, Failure> {
         match self {
             Command::Demo(command) => command.run(),
+            Command::Serve(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Detect(command) => command.run(),
             Command::Reconstruct(command) => command.run(),

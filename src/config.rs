@@ -3,6 +3,7 @@
 //! Reading has no effects beyond reading the file: no device is touched. A path that begins with `./` or has no leading `/`
 //! is taken from the folder of the configuration, a port only where it begins with `./`.
 
+mod service;
 mod table;
 
 use std::collections::BTreeMap;
@@ -16,6 +17,7 @@ use glam::DVec3;
 
 use crate::acquire::{Calibration, ScanPlan};
 use crate::geometry::RigidTransform;
+pub use service::Service;
 use table::{Lines, calibrated, calibration, pose, vector};
 
 /// A profiler silent for this long has not reached the end of its scan: the slowest stages we know of trigger once a second.
@@ -41,6 +43,8 @@ pub struct Cell {
     pub profilers: Vec<ProfilerConfig>,
     /// In the order of the file.
     pub probes: Vec<ProbeConfig>,
+    /// How the daemon serves it.
+    pub service: Service,
 }
 
 /// A checked profiler.
@@ -240,7 +244,10 @@ impl Checker<'_> {
         let part = top.needed("part", "a table [part]", Keys::table);
         let stage = top.needed("stage", "a table [stage]", Keys::table);
         let devices = top.tables("device");
+        let service = top.table("service");
         self.add_all(&[], "", problems(top));
+        let (service, mistakes) = service::service(service, &|path| self.beside(path));
+        self.add_all(&["service"], "service", mistakes);
         let part = part.and_then(|part| self.part(part));
         let stage = stage.and_then(|stage| self.stage(stage));
         let travel_mm_per_count = stage.as_ref().map_or(DVec3::ZERO, |stage| stage.0);
@@ -274,6 +281,7 @@ impl Checker<'_> {
             plan: stage?.1,
             profilers,
             probes,
+            service,
         })
     }
 

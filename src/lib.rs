@@ -22,6 +22,8 @@ pub mod report;
 
 pub mod acquire;
 
+pub mod store;
+
 pub mod config;
 
 pub mod cell;

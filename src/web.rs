@@ -3,6 +3,8 @@
 //! Hides the server. [`serve`] listens where the caller says and stops when the caller says; nothing can be changed from
 //! outside through it.
 
+mod service;
+
 use std::convert::Infallible;
 use std::future::Future;
 use std::sync::Arc;
@@ -19,6 +21,8 @@ use tokio::net::TcpListener;
 use tokio::sync::{oneshot, watch};
 
 use crate::report::{Report, content_security_policy};
+
+pub use service::serve_cell;
 
 /// Everything that is shown of one inspection, ready to be sent.
 #[derive(Debug, Clone, Default)]

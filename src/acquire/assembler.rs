@@ -133,6 +133,11 @@ impl Assembler {
         self.last.map(|last| last.encoder)
     }
 
+    /// The points placed so far, in the machine frame.
+    pub fn positions(&self) -> &[DVec3] {
+        &self.cloud.positions
+    }
+
     /// The device's name.
     pub fn device(&self) -> &str {
         &self.cloud.views[0].device

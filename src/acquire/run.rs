@@ -1,13 +1,14 @@
 //! A scan as it runs: one thread a profiler, one place where their profiles meet.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use acies_drivers::capture::Profile;
 use acies_drivers::device::{Losses, Profiler};
 use acies_drivers::error::DeviceError;
+use glam::DVec3;
 
 use super::{Assembler, Calibration, Scan, ViewRecord};
 use crate::points::{Frame, PointCloud};
@@ -57,6 +58,28 @@ pub enum ScanEvent {
     },
 }
 
+/// Who follows a scan while it runs. Any closure that takes a [`ScanEvent`] does.
+pub trait ScanWatch {
+    /// Something happened.
+    fn event(&mut self, event: ScanEvent);
+
+    /// A profile of the view `view` came, and these points were made of it (machine, mm): none where it could not be placed.
+    fn profile(&mut self, view: usize, profile: &Profile, points: &[DVec3]) {
+        let _ = (view, profile, points);
+    }
+
+    /// Whether the scan should be given up; asked after every profile and 20 times a second.
+    fn aborted(&mut self) -> bool {
+        false
+    }
+}
+
+impl<F: FnMut(ScanEvent)> ScanWatch for F {
+    fn event(&mut self, event: ScanEvent) {
+        self(event);
+    }
+}
+
 /// Why a scan could not be started.
 #[derive(Debug, thiserror::Error)]
 pub enum ScanError {
@@ -91,12 +114,14 @@ enum Message {
 /// A device that is lost in mid-scan makes its view incomplete, with what it delivered kept; it is never resumed, since a half
 /// scanned part is not a whole one.
 ///
+/// A scan that is given up ends with what came so far; its views are incomplete.
+///
 /// # Errors
 /// [`ScanError`] when a profiler does not start; those already started are stopped.
 pub fn scan(
     mut profilers: Vec<Profiling>,
     plan: ScanPlan,
-    watch: &mut dyn FnMut(ScanEvent),
+    watch: &mut dyn ScanWatch,
 ) -> Result<(Scan, Vec<Profiling>), ScanError> {
     if profilers.is_empty() {
         return Err(ScanError::NoProfiler);
@@ -193,6 +218,7 @@ struct Views {
     assemblers: Vec<Assembler>,
     first_counts: Vec<Option<i64>>,
     ended: Vec<Option<(Losses, Option<DeviceError>)>>,
+    aborted: bool,
 }
 
 impl Views {
@@ -205,6 +231,7 @@ impl Views {
                 .collect(),
             first_counts: vec![None; profilers.len()],
             ended: profilers.iter().map(|_| None).collect(),
+            aborted: false,
         }
     }
 
@@ -212,39 +239,62 @@ impl Views {
         &mut self,
         receiver: &Receiver<Message>,
         done: &[AtomicBool],
-        watch: &mut dyn FnMut(ScanEvent),
+        watch: &mut dyn ScanWatch,
     ) {
-        for message in receiver {
+        loop {
+            let message = match receiver.recv_timeout(POLL) {
+                Ok(message) => Some(message),
+                Err(RecvTimeoutError::Timeout) => None,
+                Err(RecvTimeoutError::Disconnected) => return,
+            };
             match message {
-                Message::Profile(view, profile) => {
-                    self.assemblers[view].push(&profile);
-                    let count = self.assemblers[view].encoder();
-                    self.first_counts[view] = self.first_counts[view].or(count);
-                    if count.is_some_and(|count| count >= self.plan.end_count) {
-                        done[view].store(true, Ordering::Release);
-                    }
-                    let profiles = self.assemblers.iter().map(Assembler::profiles).sum();
-                    watch(ScanEvent::Progress {
-                        profiles,
-                        share: self.share(),
-                    });
-                }
-                Message::Ended {
+                Some(Message::Profile(view, profile)) => self.place(view, &profile, done, watch),
+                Some(Message::Ended {
                     view,
                     losses,
                     error,
-                } => {
+                }) => {
                     if let Some(error) = &error {
                         let device = self.assemblers[view].device().to_owned();
-                        watch(ScanEvent::Lost {
+                        watch.event(ScanEvent::Lost {
                             device,
                             error: chain(error),
                         });
                     }
                     self.ended[view] = Some((losses, error));
                 }
+                None => {}
+            }
+            if !self.aborted && watch.aborted() {
+                self.aborted = true;
+                for view in done {
+                    view.store(true, Ordering::Release);
+                }
             }
         }
+    }
+
+    fn place(
+        &mut self,
+        view: usize,
+        profile: &Profile,
+        done: &[AtomicBool],
+        watch: &mut dyn ScanWatch,
+    ) {
+        let assembler = &mut self.assemblers[view];
+        let before = assembler.positions().len();
+        assembler.push(profile);
+        watch.profile(view, profile, &assembler.positions()[before..]);
+        let count = assembler.encoder();
+        self.first_counts[view] = self.first_counts[view].or(count);
+        if count.is_some_and(|count| count >= self.plan.end_count) {
+            done[view].store(true, Ordering::Release);
+        }
+        let profiles = self.assemblers.iter().map(Assembler::profiles).sum();
+        watch.event(ScanEvent::Progress {
+            profiles,
+            share: self.share(),
+        });
     }
 
     /// Share of the way of the view that is farthest behind.
@@ -284,6 +334,11 @@ impl Views {
                     "{}: lost during the scan: {}",
                     profiling.name,
                     chain(error)
+                ));
+            } else if !reached && self.aborted {
+                findings.push(format!(
+                    "{}: the scan was given up before its end",
+                    profiling.name
                 ));
             } else if !reached {
                 findings.push(incomplete(&profiling.name, stood_at, self.plan));
@@ -454,7 +509,7 @@ mod tests {
         let (left, left_laser) = profiling("left", 500, |_| {});
         let (right, right_laser) = profiling("right", 500, |_| {});
         let mut last_share = 0.0;
-        let mut watch = |event| match event {
+        let mut watch = |event: ScanEvent| match event {
             ScanEvent::Progress { share, .. } => last_share = share,
             ScanEvent::Lost { device, error } => panic!("{device}: {error}"),
         };
@@ -481,7 +536,7 @@ mod tests {
         let (left, _) = profiling("left", 30, |scripted| scripted.fails = true);
         let (right, _) = profiling("right", 500, |_| {});
         let mut lost = Vec::new();
-        let mut watch = |event| {
+        let mut watch = |event: ScanEvent| {
             if let ScanEvent::Lost { device, error } = event {
                 lost.push((device, error));
             }
@@ -500,7 +555,7 @@ mod tests {
     #[test]
     fn a_stage_that_stops_early_is_said_with_where_it_stood() {
         let (left, _) = profiling("left", 30, |_| {});
-        let (scan, _) = scan(vec![left], PLAN, &mut |_| {}).unwrap();
+        let (scan, _) = scan(vec![left], PLAN, &mut |_: ScanEvent| {}).unwrap();
         assert_eq!(
             scan.views[0].findings,
             [
@@ -514,12 +569,14 @@ mod tests {
     fn a_device_that_does_not_start_stops_those_that_did() {
         let (left, left_laser) = profiling("left", 500, |_| {});
         let (right, _) = profiling("right", 500, |scripted| scripted.refuses = true);
-        let error = scan(vec![left, right], PLAN, &mut |_| {})
+        let error = scan(vec![left, right], PLAN, &mut |_: ScanEvent| {})
             .map(|_| ())
             .unwrap_err();
         assert_eq!(error.to_string(), "right did not start");
         assert!(!left_laser.load(Ordering::Acquire));
-        let none = scan(Vec::new(), PLAN, &mut |_| {}).map(|_| ()).unwrap_err();
+        let none = scan(Vec::new(), PLAN, &mut |_: ScanEvent| {})
+            .map(|_| ())
+            .unwrap_err();
         assert_eq!(
             none.to_string(),
             "the cell has no profiler; add a [[device]] with a profiler's driver to its configuration"

@@ -67,7 +67,7 @@ fn check_part(cell: &Cell) -> Result<(), Vec<LocatedMistake>> {
         },
     };
     let recipe_file = cell.recipe.as_deref().unwrap_or(Path::new("recipe"));
-    let (nominal, recipe) = cell::read_part(cell).map_err(|error| match error {
+    let part = cell::read_part(cell).map_err(|error| match error {
         CellError::Nominal(error) => {
             vec![told(
                 &cell.nominal,
@@ -83,6 +83,7 @@ fn check_part(cell: &Cell) -> Result<(), Vec<LocatedMistake>> {
             "a recipe without mistakes",
         )],
     })?;
+    let (nominal, recipe) = (part.nominal, part.recipe);
     let is_face = |entity: &u64| nominal.faces.iter().any(|face| face.entity == *entity);
     let facts = crate::inspect::all_edge_facts(&nominal);
     let faces = recipe

@@ -2,11 +2,13 @@
 
 use std::fs;
 use std::io::IsTerminal;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::SystemTime;
 
 use acies_drivers::link::cable::Cable;
-use acies_simulators::demo_cell::{DemoCell, DemoOptions};
+use acies_simulators::demo_cell::{DemoCell, DemoOptions, RunningCell};
 use acies_simulators::demo_part::Defects;
 use acies_simulators::faults::Faults;
 use anyhow::{Context, anyhow};
@@ -16,8 +18,8 @@ use super::{Failure, Status, print_line, status_of};
 use crate::cell::{self, CellError, Outcome};
 use crate::config::Cell;
 use crate::points::write_scan;
-use crate::report::{DeviceFacts, Facts, Report, ScanFacts, print_table, to_ply};
-use crate::web;
+use crate::report::{Report, print_table, to_ply};
+use crate::store::Order;
 
 /// What the demo's folder holds before the first scan.
 const FILES: [(&str, &str); 3] = [
@@ -51,9 +53,9 @@ pub struct Demo {
     /// Scan in real time, as the instruments would.
     #[arg(long)]
     paced: bool,
-    /// Stay, and show the report's page on this address.
+    /// Stay as the daemon of the simulated cell, with its page on this address.
     #[arg(long, value_name = "ADDRESS", num_args = 0..=1, default_missing_value = "127.0.0.1:8370")]
-    serve: Option<String>,
+    serve: Option<SocketAddr>,
     /// Print the report as one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -65,22 +67,33 @@ impl Demo {
     /// # Errors
     /// When the folder cannot be written or a simulated device does not start.
     pub fn run(self) -> Result<Status, Failure> {
-        let (outcome, report) = self.inspect()?;
-        let scan_ply = self.write(&outcome, &report)?;
+        let (_playing, cell) = self.set_up()?;
+        if let Some(address) = self.serve {
+            return self.serve_cell(cell, address);
+        }
+        let (outcome, report) = self.inspect(&cell)?;
+        self.write(&outcome, &report)?;
         if self.json {
             print_line(&report.to_json())?;
         } else {
             self.show(&outcome, &report)?;
         }
-        if let Some(address) = &self.serve {
-            let content = web::Content::new(&report, Some(scan_ply));
-            super::serve_until_interrupted(address, content)?;
-        }
         Ok(status_of(&report))
     }
 
-    /// Sets the cell up in its folder, plays its devices and runs the job.
-    fn inspect(&self) -> Result<(Outcome, Report), Failure> {
+    /// Stays, as the daemon of the simulated cell; a first part is started at once.
+    fn serve_cell(&self, mut cell: Cell, address: SocketAddr) -> Result<Status, Failure> {
+        cell.service.address = address;
+        cell.service.simulated = true;
+        let first = Order {
+            part_serial: "DEMO-1".to_owned(),
+            ..Order::default()
+        };
+        super::serve::serve(cell, Arc::new(Cable), Some(first))
+    }
+
+    /// Sets the cell up in its folder and plays its devices for as long as the first value lives.
+    fn set_up(&self) -> Result<(RunningCell, Cell), Failure> {
         let ports = self.output.join("dev");
         fs::create_dir_all(&ports).map_err(|error| writing(error, &ports))?;
         for (name, text) in FILES {
@@ -96,22 +109,30 @@ impl Demo {
         }
         options.faults = self.faults.clone().unwrap_or_default();
         let playing = DemoCell::with_options(options).start(&ports);
-        let _playing = playing
+        let playing = playing
             .context("the simulated devices")
             .map_err(Failure::Io)?;
-
         let cell = Cell::read(&self.output.join("cell.toml"))
             .map_err(|errors| Failure::Internal(anyhow!("the demo's own cell\n{errors}")))?;
+        Ok((playing, cell))
+    }
+
+    fn inspect(&self, cell: &Cell) -> Result<(Outcome, Report), Failure> {
         let mut progress = CellProgress::new();
-        let outcome = cell::run(&cell, &Cable, &mut |state| progress.tell(&state));
+        let outcome = cell::run(cell, &Cable, &mut |step| progress.tell(&step));
         progress.finish();
         let outcome = outcome.map_err(failure_of)?;
-        let report = Report::new(&outcome.inspection, &facts(&outcome, self.seed));
+        let report = cell::report_of(
+            &outcome,
+            "acies-demo-part",
+            SystemTime::now(),
+            Some(self.seed),
+        );
         Ok((outcome, report))
     }
 
-    /// The report in its forms and the scan; returns the coloured scan.
-    fn write(&self, outcome: &Outcome, report: &Report) -> Result<Vec<u8>, Failure> {
+    /// The report in its forms and the scan.
+    fn write(&self, outcome: &Outcome, report: &Report) -> Result<(), Failure> {
         for name in ["report.json", "report.html", "report.csv"] {
             let written = report.write_atomically(&self.output.join(name));
             written.map_err(|error| Failure::Io(error.into()))?;
@@ -128,8 +149,7 @@ impl Demo {
         let coloured = to_ply(cloud, &features).map_err(|error| Failure::Internal(error.into()))?;
         let path = self.output.join("edges.ply");
         crate::points::write::write_atomically(&path, &coloured)
-            .map_err(|error| Failure::Io(error.into()))?;
-        Ok(coloured)
+            .map_err(|error| Failure::Io(error.into()))
     }
 
     fn show(&self, outcome: &Outcome, report: &Report) -> Result<(), Failure> {
@@ -166,36 +186,5 @@ fn failure_of(error: CellError) -> Failure {
         CellError::Nominal(_) | CellError::Recipe { .. } => Failure::BadInput(error.into()),
         CellError::Kind { .. } => Failure::BadInput(error.into()),
         _ => Failure::Io(error.into()),
-    }
-}
-
-/// What the report says beside what was found.
-fn facts(outcome: &Outcome, seed: u64) -> Facts {
-    let scan = outcome.inspection.scan.as_ref();
-    let profilers = outcome.scan.views.iter().map(|view| DeviceFacts {
-        name: view.device.clone(),
-        identity: view.identity.clone(),
-        losses: Some(view.losses),
-    });
-    let probes = outcome.probes.iter().map(|(name, identity)| DeviceFacts {
-        name: name.clone(),
-        identity: identity.clone(),
-        losses: None,
-    });
-    Facts {
-        with_budgets: false,
-        part: "acies-demo-part".to_owned(),
-        nominal: "part.step".to_owned(),
-        created: SystemTime::now(),
-        simulated_seed: Some(seed),
-        scan: ScanFacts {
-            points: outcome.scan.cloud.len(),
-            spacing_mm: scan.map(|scan| scan.spacing.mean_mm),
-            spacing_along_line_mm: scan.map(|scan| scan.spacing.along_mm),
-            spacing_across_lines_mm: scan.map(|scan| scan.spacing.across_mm),
-            noise_mm: scan.map(|scan| scan.noise_mm),
-        },
-        devices: profilers.chain(probes).collect(),
-        recipe: outcome.recipe.clone(),
     }
 }

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 
-use crate::cell::State;
+use crate::cell::Step;
 
 /// How long a command works before it says so.
 const QUIET: Duration = Duration::from_secs(1);
@@ -27,26 +27,26 @@ impl CellProgress {
         }
     }
 
-    /// Shows `state`.
-    pub fn tell(&mut self, state: &State) {
+    /// Shows `step`.
+    pub fn tell(&mut self, step: &Step) {
         if self.bar.is_hidden() && self.began.elapsed() > QUIET {
             self.bar.set_draw_target(ProgressDrawTarget::stderr());
         }
-        let message = match state {
-            State::Opening { device } => format!("opening {device}"),
-            State::Touching { done, of } => {
+        let message = match step {
+            Step::Opening { device } => format!("opening {device}"),
+            Step::Touching { done, of } => {
                 self.bar.set_position((1000 * done / of.max(&1)) as u64);
                 format!("touch {} of {of}", done + 1)
             }
-            State::Scanning { profiles, share } => {
+            Step::Scanning { profiles, share } => {
                 self.bar.set_position((1000.0 * share) as u64);
                 format!("scanning, {profiles} profiles")
             }
-            State::Lost { device, error } => {
+            Step::Lost { device, error } => {
                 tracing::error!(device, error, "lost during the scan");
                 return;
             }
-            State::Inspecting => "finding the pose and measuring the edges".to_owned(),
+            Step::Inspecting => "finding the pose and measuring the edges".to_owned(),
         };
         self.bar.set_message(message);
     }

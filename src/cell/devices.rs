@@ -1,0 +1,217 @@
+//! One thread a device: it opens the device, tries again for ever where it cannot, and lends the open device to a job.
+
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use acies_drivers::device::{Identity, Instrument, Setup};
+use acies_drivers::link::Links;
+
+use crate::config::Cell;
+
+/// First wait after a failure; doubled up to [`WAIT_MAX`] while it goes on failing.
+const WAIT_FIRST: Duration = Duration::from_millis(250);
+/// Longest wait between two tries: an operator who plugs a cable in looks at the screen for about as long.
+const WAIT_MAX: Duration = Duration::from_secs(5);
+/// How often an idle device is asked whether it is still there.
+const CHECK_EVERY: Duration = Duration::from_secs(5);
+
+/// What a device's thread tells.
+#[derive(Debug)]
+pub(super) enum News {
+    /// Open, and the one that was asked for.
+    Ready(Identity),
+    /// Not there, or not the one that was asked for.
+    Failed(String),
+}
+
+/// What a device's thread is asked.
+enum Request {
+    Lend(Sender<Option<Instrument>>),
+    Return(Option<Instrument>),
+    Retry,
+}
+
+/// Looks after one device. Dropping it closes the device.
+pub(super) struct Supervisor {
+    requests: Option<Sender<Request>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Supervisor {
+    /// Begins to open device `index` of `cell`: profilers first, then probes. `tell` is called from the device's thread.
+    pub(super) fn start(
+        cell: &Arc<Cell>,
+        index: usize,
+        links: &Arc<dyn Links + Send + Sync>,
+        tell: impl Fn(News) + Send + 'static,
+    ) -> std::io::Result<Self> {
+        let (requests, received) = channel();
+        let (cell, links) = (cell.clone(), links.clone());
+        let name = format!("device {}", name_of(&cell, index));
+        let thread = thread::Builder::new().name(name).spawn(move || {
+            look_after(setup_of(&cell, index), &*links, &received, &tell);
+        })?;
+        Ok(Self {
+            requests: Some(requests),
+            thread: Some(thread),
+        })
+    }
+
+    /// The open device, for a job; `None` where it is not open now.
+    pub(super) fn lend(&self) -> Option<Instrument> {
+        let (answer, answered) = channel();
+        self.ask(Request::Lend(answer));
+        answered.recv().ok().flatten()
+    }
+
+    /// Gives the device back; `None` for one that was lost: it is opened anew.
+    pub(super) fn give_back(&self, instrument: Option<Instrument>) {
+        self.ask(Request::Return(instrument));
+    }
+
+    /// Tries at once instead of waiting.
+    pub(super) fn retry(&self) {
+        self.ask(Request::Retry);
+    }
+
+    fn ask(&self, request: Request) {
+        if let Some(requests) = &self.requests {
+            // The thread ends only after this sender is gone, or by a panic, which has been logged.
+            let _ = requests.send(request);
+        }
+    }
+}
+
+impl Drop for Supervisor {
+    fn drop(&mut self) {
+        self.requests = None;
+        if let Some(thread) = self.thread.take() {
+            // A panic of the thread has been logged by the runtime; there is nobody left to tell.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The name of a cell's device by its index: profilers first, then probes.
+pub(super) fn name_of(cell: &Cell, index: usize) -> &str {
+    match index.checked_sub(cell.profilers.len()) {
+        None => &cell.profilers[index].name,
+        Some(probe) => &cell.probes[probe].name,
+    }
+}
+
+fn setup_of(cell: &Cell, index: usize) -> &dyn Setup {
+    match index.checked_sub(cell.profilers.len()) {
+        None => &*cell.profilers[index].setup,
+        Some(probe) => &*cell.probes[probe].setup,
+    }
+}
+
+fn look_after(
+    setup: &dyn Setup,
+    links: &dyn Links,
+    requests: &Receiver<Request>,
+    tell: &dyn Fn(News),
+) {
+    let mut wait = WAIT_FIRST;
+    let mut told_ready = false;
+    loop {
+        match setup.open(links) {
+            Ok(instrument) => {
+                wait = WAIT_FIRST;
+                if !told_ready {
+                    tell(News::Ready(identity(&instrument)));
+                    told_ready = true;
+                }
+                match keep(instrument, requests) {
+                    Kept::Check => {}
+                    Kept::Lost => told_ready = false,
+                    Kept::End => return,
+                }
+            }
+            Err(error) => {
+                told_ready = false;
+                tell(News::Failed(chain(&error)));
+                if !pause(wait, requests) {
+                    return;
+                }
+                wait = (2 * wait).min(WAIT_MAX);
+            }
+        }
+    }
+}
+
+/// How the time with an open device ended.
+enum Kept {
+    /// It should be opened anew, to see whether it is still there.
+    Check,
+    /// It is gone.
+    Lost,
+    /// The cell ends.
+    End,
+}
+
+/// Keeps an open device until it is to be checked, was lost, or the cell ends; lends it meanwhile.
+fn keep(instrument: Instrument, requests: &Receiver<Request>) -> Kept {
+    let mut held = Some(instrument);
+    loop {
+        // A device that is lent comes back in the end: the job that has it returns it, or says that it is lost.
+        let request = match &held {
+            Some(_) => requests.recv_timeout(CHECK_EVERY),
+            None => requests.recv().map_err(RecvTimeoutError::from),
+        };
+        match request {
+            Ok(Request::Lend(answer)) => {
+                if let Err(unsent) = answer.send(held.take()) {
+                    held = unsent.0;
+                }
+            }
+            Ok(Request::Return(Some(instrument))) => held = Some(instrument),
+            Ok(Request::Return(None)) => return Kept::Lost,
+            Ok(Request::Retry) => {}
+            Err(RecvTimeoutError::Timeout) => return Kept::Check,
+            Err(RecvTimeoutError::Disconnected) => return Kept::End,
+        }
+    }
+}
+
+/// Waits for the next try; false where the cell ends.
+fn pause(wait: Duration, requests: &Receiver<Request>) -> bool {
+    let until = std::time::Instant::now() + wait;
+    loop {
+        let left = until.saturating_duration_since(std::time::Instant::now());
+        match requests.recv_timeout(left) {
+            Ok(Request::Lend(answer)) => {
+                // Nobody may be waiting any more.
+                let _ = answer.send(None);
+            }
+            Ok(Request::Return(_)) => {}
+            Ok(Request::Retry) | Err(RecvTimeoutError::Timeout) => return true,
+            Err(RecvTimeoutError::Disconnected) => return false,
+        }
+    }
+}
+
+fn identity(instrument: &Instrument) -> Identity {
+    match instrument {
+        Instrument::Profiler(profiler) => profiler.identity().clone(),
+        Instrument::Probe(probe) => probe.identity().clone(),
+    }
+}
+
+/// An error with its causes, on one line.
+pub(super) fn chain(error: &dyn std::error::Error) -> String {
+    let mut text = error.to_string();
+    let mut cause = error.source();
+    while let Some(inner) = cause {
+        // Some errors say their cause themselves; once is enough.
+        let more = inner.to_string();
+        if !text.contains(&more) {
+            text = format!("{text}: {more}");
+        }
+        cause = inner.source();
+    }
+    text
+}

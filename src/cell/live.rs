@@ -1,0 +1,134 @@
+//! The scan as it grows, thinned so that any number of watchers costs little.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use acies_drivers::capture::Profile;
+use glam::DVec3;
+use serde::Serialize;
+use utoipa::ToSchema;
+
+/// Points kept for showing. When there are as many, every second one goes and from then on half as many come.
+const POINTS_KEPT: usize = 200_000;
+
+/// Columns of a profile that are shown.
+const COLUMNS_SHOWN: usize = 640;
+
+/// The scan that runs, or ran last.
+#[derive(Debug, Default)]
+pub struct Live {
+    inner: Mutex<Inner>,
+}
+
+#[derive(Debug, Default)]
+struct Inner {
+    job: i64,
+    generation: u64,
+    points: Vec<[f32; 3]>,
+    stride: usize,
+    skipped: usize,
+    profiles: Vec<LiveProfile>,
+}
+
+/// A part of the points.
+#[derive(Debug, Clone, PartialEq)]
+pub struct LivePoints {
+    /// The inspection.
+    pub job: i64,
+    /// Differs where the points were thinned or another scan began: what was fetched before no longer belongs to these.
+    pub generation: u64,
+    /// Index of the first one.
+    pub from: usize,
+    /// Machine frame, mm.
+    pub points: Vec<[f32; 3]>,
+}
+
+/// The newest profile of one device.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, ToSchema)]
+pub struct LiveProfile {
+    /// The device.
+    pub device: String,
+    /// Its number in the run.
+    pub sequence: u32,
+    /// Across the laser's axis, mm.
+    pub x_mm: Vec<f32>,
+    /// Along the laser's axis, mm; null where nothing was seen.
+    pub z_mm: Vec<Option<f32>>,
+}
+
+impl Live {
+    /// Begins to show inspection `job` with these devices.
+    pub(super) fn begin(&self, job: i64, devices: &[String]) {
+        let mut inner = self.lock();
+        let generation = inner.generation + 1;
+        let profile = |device: &String| LiveProfile {
+            device: device.clone(),
+            ..LiveProfile::default()
+        };
+        *inner = Inner {
+            job,
+            generation,
+            points: Vec::new(),
+            stride: 1,
+            skipped: 0,
+            profiles: devices.iter().map(profile).collect(),
+        };
+    }
+
+    /// Takes a profile of device `view` and the points made of it.
+    pub(super) fn push(&self, view: usize, profile: &Profile, points: &[DVec3]) {
+        let mut inner = self.lock();
+        for point in points {
+            inner.skipped += 1;
+            if inner.skipped < inner.stride {
+                continue;
+            }
+            inner.skipped = 0;
+            inner.points.push(point.as_vec3().to_array());
+            if inner.points.len() >= POINTS_KEPT {
+                inner.thin();
+            }
+        }
+        let stride = profile.x_mm.len().div_ceil(COLUMNS_SHOWN).max(1);
+        if let Some(shown) = inner.profiles.get_mut(view) {
+            shown.sequence = profile.sequence;
+            let x = profile.x_mm.iter().step_by(stride);
+            shown.x_mm = x.map(|&x| x as f32).collect();
+            let z = profile.z_mm.iter().step_by(stride);
+            shown.z_mm = z.map(|&z| z.is_finite().then_some(z as f32)).collect();
+        }
+    }
+
+    /// The points from index `from` on; all of them where `generation` is not the present one.
+    pub fn points(&self, generation: u64, from: usize) -> LivePoints {
+        let inner = self.lock();
+        let known = generation == inner.generation && from <= inner.points.len();
+        let from = if known { from } else { 0 };
+        LivePoints {
+            job: inner.job,
+            generation: inner.generation,
+            from,
+            points: inner.points[from..].to_vec(),
+        }
+    }
+
+    /// The newest profile of every device.
+    pub fn profiles(&self) -> Vec<LiveProfile> {
+        self.lock().profiles.clone()
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Inner> {
+        self.inner.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Inner {
+    fn thin(&mut self) {
+        let mut odd = false;
+        self.points.retain(|_| {
+            odd = !odd;
+            odd
+        });
+        self.stride *= 2;
+        self.generation += 1;
+    }
+}
