@@ -56,7 +56,8 @@ pub(super) fn acquire_for(acquisition: Acquisition) {
         result: result.map(Box::new),
     });
     let kept = match writer {
-        Some(Ok(writer)) => ScanWriter::finish(writer)
+        Some(Ok(writer)) => writer
+            .finish(whole)
             .map(|bytes| (bytes, whole))
             .map_err(|error| chain(&error)),
         Some(Err(error)) => Err(error),

@@ -441,8 +441,7 @@ impl Running {
     fn run(&mut self, received: &Receiver<Event>, beat: &Mutex<Instant>) {
         loop {
             self.upkeep();
-            self.begin_next();
-            self.publish();
+            self.settle();
             *beat.lock().unwrap_or_else(PoisonError::into_inner) = Instant::now();
             if self.ending && self.acquiring.is_none() && self.computing.is_empty() {
                 return;
@@ -453,6 +452,12 @@ impl Running {
                 Err(RecvTimeoutError::Disconnected) => return,
             }
         }
+    }
+
+    /// Begins what can begin and publishes what is so: who asked for something sees it in the next snapshot.
+    fn settle(&mut self) {
+        self.begin_next();
+        self.publish();
     }
 
     fn handle(&mut self, event: Event) {
@@ -466,6 +471,7 @@ impl Running {
                 answer,
             } => {
                 let started = self.start(order, &operator, key.as_deref(), mode);
+                self.settle();
                 // Who asked may have gone away; the inspection is in the history.
                 let _ = answer.send(started);
             }
@@ -474,7 +480,9 @@ impl Running {
                 person,
                 answer,
             } => {
-                let _ = answer.send(self.command(command, &person));
+                let done = self.command(command, &person);
+                self.settle();
+                let _ = answer.send(done);
             }
             Event::Part { part, version } => {
                 self.part = Some(part);
@@ -865,6 +873,7 @@ impl Running {
 
     fn kept(&mut self, job: i64, kept: Result<(u64, bool), String>) {
         let noted = match kept {
+            Ok((0, _)) => self.store.forget_scan(job),
             Ok((bytes, whole)) => self.store.scan_kept(job, bytes, whole),
             Err(error) => {
                 tracing::error!(inspection = job, error, "raw data not kept");
@@ -878,6 +887,7 @@ impl Running {
 
     fn concluded(&mut self, id: i64, result: Result<Inspection, String>) {
         self.computing.retain(|job| job.status.id != id);
+        self.look_at_disk();
         match result {
             Ok(inspection) => {
                 tracing::info!(
@@ -918,13 +928,17 @@ impl Running {
             Ok(_) => {}
             Err(error) => tracing::error!(error = chain(&error), "retention"),
         }
-        match self.store.usage() {
-            Ok(usage) => self.snapshot.storage = Some(usage),
-            Err(error) => self.fault = Some(chain(&error)),
-        }
+        self.look_at_disk();
         for index in 0..self.snapshot.devices.len() {
             let fresh = device_status(&self.cell, index, now);
             self.snapshot.devices[index].calibration_due = fresh.calibration_due;
+        }
+    }
+
+    fn look_at_disk(&mut self) {
+        match self.store.usage() {
+            Ok(usage) => self.snapshot.storage = Some(usage),
+            Err(error) => self.fault = Some(chain(&error)),
         }
     }
 

@@ -398,17 +398,14 @@ impl Store {
         })
     }
 
-    /// The inspections that were neither finished nor aborted, oldest first, each with its raw data's file.
-    ///
-    /// # Errors
-    /// [`StoreError::Database`].
-    pub fn unfinished(&self) -> Result<Vec<(Inspection, Option<String>)>, StoreError> {
+    /// The inspections that were neither finished, refused nor aborted, oldest first.
+    pub(super) fn unfinished(&self) -> Result<Vec<Inspection>, StoreError> {
         self.read(|connection| {
             let sql = format!(
-                "SELECT {COLUMNS}, scan_file FROM inspections WHERE phase IN ('queued', 'acquiring', 'computing') ORDER BY id"
+                "SELECT {COLUMNS} FROM inspections WHERE phase IN ('queued', 'acquiring', 'computing') ORDER BY id"
             );
             let mut query = connection.prepare_cached(&sql)?;
-            let rows = query.query_map((), |row| Ok((inspection(row)?, row.get(20)?)))?;
+            let rows = query.query_map((), inspection)?;
             rows.collect()
         })
     }

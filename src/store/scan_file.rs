@@ -5,7 +5,7 @@
 //! ```
 //!
 //! Little-endian throughout. A chunk of kind 0 names a view (JSON), one of kind 1 holds profiles (zstd), one of kind 2 is the
-//! end. While the run lasts the file is called `NAME.part`; each chunk is handed to the system as soon as it is full, so that
+//! end of a run that was not cut short. While the run lasts the file is called `NAME.part`; each chunk is handed to the system as soon as it is full, so that
 //! after a crash everything up to the last whole chunk can be read. A chunk of profiles holds the numbers of each profile as
 //! the difference (exclusive or) to the profile before, one byte plane after the other: a sensor's grid stands still and its
 //! heights change little, so that most planes are zeros.
@@ -21,8 +21,9 @@ use crc::{CRC_32_ISCSI, Crc};
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::acquire::Calibration;
+use crate::acquire::{Assembler, Calibration};
 use crate::geometry::RigidTransform;
+use crate::points::PointCloud;
 
 const MAGIC: &[u8; 9] = b"ACIESRAW\x01";
 const CRC: Crc<u32> = Crc::<u32>::new(&CRC_32_ISCSI);
@@ -98,6 +99,7 @@ pub struct ScanWriter {
     file: BufWriter<File>,
     pending: Vec<Chunk>,
     bytes: u64,
+    profiles: u64,
 }
 
 /// Profiles of one view that are not yet written.
@@ -127,6 +129,7 @@ impl ScanWriter {
             file: BufWriter::new(file),
             pending: views.iter().map(|_| Chunk::default()).collect(),
             bytes: MAGIC.len() as u64,
+            profiles: 0,
         };
         let begun = writer.file.write_all(MAGIC);
         writer.io(begun)?;
@@ -143,21 +146,29 @@ impl ScanWriter {
     /// [`ScanFileError::File`]; the run may go on, its file is lost.
     pub fn push(&mut self, view: usize, profile: &Profile) -> Result<(), ScanFileError> {
         self.pending[view].push(profile);
+        self.profiles += 1;
         if self.pending[view].numbers.len() >= 2 * COLUMNS_A_CHUNK {
             self.flush(view)?;
         }
         Ok(())
     }
 
-    /// Ends the file, brings it onto the disk and gives it its name. Returns its size, bytes.
+    /// Ends the file, brings it onto the disk and gives it its name. Returns its size, bytes; 0 where there was no profile,
+    /// and then no file either. `whole` says whether the run came to its end.
     ///
     /// # Errors
     /// [`ScanFileError::File`]; the file then still is called `.part`.
-    pub fn finish(mut self) -> Result<u64, ScanFileError> {
+    pub fn finish(mut self, whole: bool) -> Result<u64, ScanFileError> {
+        if self.profiles == 0 {
+            let removed = fs::remove_file(&self.part);
+            return self.io(removed).map(|()| 0);
+        }
         for view in 0..self.pending.len() {
             self.flush(view)?;
         }
-        self.chunk(END, &[])?;
+        if whole {
+            self.chunk(END, &[])?;
+        }
         let placed = self
             .file
             .flush()
@@ -311,6 +322,25 @@ impl ScanReader {
     /// Whether the end of the run was reached; known once [`ScanReader::profiles`] gave `None`.
     pub fn whole(&self) -> bool {
         self.ended
+    }
+
+    /// The points of the whole run in the machine frame, placed as they were when it was measured: the same bits.
+    ///
+    /// # Errors
+    /// As [`ScanReader::profiles`].
+    pub fn into_cloud(mut self) -> Result<PointCloud, ScanFileError> {
+        let views = self.views.iter();
+        let mut assemblers: Vec<Assembler> = views
+            .map(|view| Assembler::new(&view.device, view.calibration))
+            .collect();
+        while let Some((view, profiles)) = self.profiles()? {
+            for profile in &profiles {
+                assemblers[view].push(profile);
+            }
+        }
+        let clouds: Vec<PointCloud> = assemblers.into_iter().map(|a| a.finish().0).collect();
+        PointCloud::merge(&clouds)
+            .map_err(|error| self.damaged(error.to_string(), "at least one view"))
     }
 
     /// The profiles of the next chunk, each with the index of its view; `None` at the end, or where a crash cut the file off.

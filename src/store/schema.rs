@@ -54,7 +54,8 @@ CREATE INDEX inspections_by_verdict ON inspections (verdict, id);
 CREATE INDEX inspections_by_order ON inspections (order_number, id);
 CREATE INDEX inspections_by_time ON inspections (requested_ms, id);
 CREATE INDEX inspections_unfinished ON inspections (phase) WHERE phase IN ('queued', 'acquiring', 'computing');
-CREATE INDEX inspections_with_scan ON inspections (id) WHERE scan_file IS NOT NULL;
+CREATE INDEX inspections_with_scan ON inspections (id, scan_bytes) WHERE scan_bytes IS NOT NULL;
+CREATE INDEX inspections_with_open_scan ON inspections (id) WHERE scan_file IS NOT NULL AND scan_bytes IS NULL;
 
 CREATE TABLE reports (
     inspection INTEGER PRIMARY KEY REFERENCES inspections (id) ON DELETE CASCADE,
@@ -109,3 +110,11 @@ CREATE TABLE audit (
 CREATE TRIGGER audit_is_not_changed BEFORE UPDATE ON audit BEGIN SELECT RAISE (ABORT, 'the audit log is never changed'); END;
 CREATE TRIGGER audit_is_not_removed BEFORE DELETE ON audit BEGIN SELECT RAISE (ABORT, 'the audit log is never shortened'); END;
 ";
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn every_migration_can_be_applied() {
+        assert_eq!(super::migrations().validate(), Ok(()));
+    }
+}

@@ -70,7 +70,7 @@ impl Store {
                 // The largest number stands for the count, which would read every row: numbers are never used again and no
                 // row is ever removed.
                 "SELECT coalesce((SELECT max(id) FROM inspections), 0), count(*), coalesce(sum(scan_bytes), 0)
-                 FROM inspections WHERE scan_file IS NOT NULL",
+                 FROM inspections WHERE scan_bytes IS NOT NULL",
                 (),
                 |row| Ok((row.get(0)?, row.get(1)?, row.get(2)?)),
             )
@@ -94,51 +94,55 @@ impl Store {
     /// # Errors
     /// [`StoreError`]; what has been mended so far stays mended.
     pub fn recover(&self, reason: &str, at: SystemTime) -> Result<Vec<Inspection>, StoreError> {
-        let mut recovered = Vec::new();
-        for (inspection, scan_file) in self.unfinished()? {
-            if let Some(name) = scan_file {
-                self.recover_scan(inspection.id, &name)?;
-            }
-            recovered.push(self.abort(inspection.id, reason, at)?);
+        let scans = self.read(|connection| {
+            let mut query = connection.prepare(
+                "SELECT id, scan_file FROM inspections WHERE scan_file IS NOT NULL AND scan_bytes IS NULL",
+            )?;
+            let rows = query.query_map((), |row| Ok((row.get(0)?, row.get(1)?)))?;
+            rows.collect::<rusqlite::Result<Vec<(i64, String)>>>()
+        })?;
+        for (id, name) in scans {
+            self.recover_scan(id, &name)?;
         }
-        Ok(recovered)
+        let unfinished = self.unfinished()?;
+        let aborted = unfinished
+            .into_iter()
+            .map(|inspection| self.abort(inspection.id, reason, at));
+        aborted.collect()
     }
 
     /// Makes the raw data of an interrupted run a whole file of what came, where anything came.
     fn recover_scan(&self, id: i64, name: &str) -> Result<(), StoreError> {
         let path = self.folder.join("scans").join(name);
-        if path.is_file() {
-            // The crash came after the file was placed and before that was noted.
-            let bytes = fs::metadata(&path).map_or(0, |metadata| metadata.len());
-            return self.scan_kept(id, bytes, true);
-        }
         let part = path.with_file_name(format!("{name}.part"));
-        let reader = part.is_file().then(|| ScanReader::open(&part));
-        let Some(Ok(mut reader)) = reader else {
+        let there = [&path, &part].into_iter().find(|path| path.is_file());
+        let Some(Ok(mut reader)) = there.map(|path| ScanReader::open(path)) else {
             self.remove(&part);
             return self.forget_scan(id);
         };
         let cut = path.with_file_name(format!("{name}.cut"));
         let mut writer = ScanWriter::create(&cut, reader.views())?;
-        let mut any = false;
         // What is damaged behind the last whole chunk is what the crash cut off.
         while let Ok(Some((view, profiles))) = reader.profiles() {
             for profile in &profiles {
                 writer.push(view, profile)?;
-                any = true;
             }
         }
-        let bytes = writer.finish()?;
+        let whole = reader.whole();
+        let bytes = writer.finish(whole)?;
         self.remove(&part);
-        if !any {
-            self.remove(&cut);
+        if bytes == 0 {
             return self.forget_scan(id);
         }
         fs::rename(&cut, &path).map_err(|source| StoreError::File { path, source })?;
-        self.scan_kept(id, bytes, false)
+        self.scan_kept(id, bytes, whole)
     }
 
-    fn forget_scan(&self, id: i64) -> Result<(), StoreError> {
+    /// An inspection without raw data.
+    ///
+    /// # Errors
+    /// [`StoreError::Database`].
+    pub fn forget_scan(&self, id: i64) -> Result<(), StoreError> {
         self.write(|connection| {
             connection.execute(
                 "UPDATE inspections SET scan_file = NULL, scan_bytes = NULL, scan_whole = NULL WHERE id = ?1",
@@ -187,7 +191,7 @@ impl Store {
             connection
                 .prepare_cached(
                     "SELECT id, scan_file, scan_bytes FROM inspections
-                     WHERE scan_file IS NOT NULL AND scan_bytes IS NOT NULL
+                     WHERE scan_bytes IS NOT NULL
                        AND id < (SELECT max(id) FROM inspections WHERE scan_bytes IS NOT NULL)
                        AND (?1 OR ended_ms < ?2 OR (verdict = 'ok' AND ended_ms < ?3))
                      ORDER BY id LIMIT 1",
