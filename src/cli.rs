@@ -1,11 +1,13 @@
 //! The command line: one file a subcommand. Argument parsing only; the work is done by the modules above.
 
 mod attached_device;
+mod backup;
 mod calibrate;
 mod check;
 mod demo;
 mod detect;
 mod devices;
+mod export;
 mod inspect;
 mod mesh;
 mod nominal;
@@ -17,6 +19,7 @@ mod record;
 mod replay;
 mod serve;
 mod simulate;
+mod support_bundle;
 
 use std::process::ExitCode;
 
@@ -33,6 +36,14 @@ pub enum Command {
     Demo(demo::Demo),
     /// Run a cell: the daemon with its page and API.
     Serve(serve::Serve),
+    /// Write everything a cell knows into a folder, while it runs.
+    Backup(backup::Backup),
+    /// Put a backup in the place of a cell's store.
+    Restore(backup::Restore),
+    /// Write every result of a cell for those who analyse elsewhere.
+    Export(export::Export),
+    /// Collect what somebody who is to help needs, in one file.
+    SupportBundle(support_bundle::SupportBundle),
     /// Measure every sharp edge of a scan against its nominal.
     Inspect(inspect::Inspect),
     /// Find the points of a scan that lie on sharp edges, corners and boundaries.
@@ -70,6 +81,10 @@ impl Command {
         match self {
             Command::Demo(command) => command.run(),
             Command::Serve(command) => command.run(),
+            Command::Backup(command) => command.run(),
+            Command::Restore(command) => command.run(),
+            Command::Export(command) => command.run(),
+            Command::SupportBundle(command) => command.run(),
             Command::Inspect(command) => command.run(),
             Command::Detect(command) => command.run(),
             Command::Reconstruct(command) => command.run(),

@@ -6,6 +6,8 @@
 
 mod export;
 mod inspections;
+#[cfg(feature = "parquet")]
+mod parquet;
 mod people;
 mod recipes;
 mod scan_file;
@@ -78,6 +80,12 @@ pub enum StoreError {
     Exists {
         /// What was to be added.
         what: String,
+    },
+    /// Somebody else has it.
+    #[error("{path}: another acies serves this store; stop that one first")]
+    InUse {
+        /// The file that is locked.
+        path: PathBuf,
     },
     /// A scan's file.
     #[error(transparent)]
@@ -168,6 +176,14 @@ impl Store {
             writer: Mutex::new(writer),
             readers: Mutex::new(Vec::new()),
         })
+    }
+
+    /// Takes the store for one daemon alone, for as long as the value lives; the system gives it back after a crash.
+    ///
+    /// # Errors
+    /// [`StoreError::InUse`] and [`StoreError::File`].
+    pub fn lock(&self) -> Result<StoreLock, StoreError> {
+        lock_folder(&self.folder)
     }
 
     /// The folder it lies in.
@@ -271,6 +287,25 @@ impl Store {
             path: self.database(),
             source,
         }
+    }
+}
+
+/// A store that is taken. Others may still read it and make backups.
+#[derive(Debug)]
+pub struct StoreLock {
+    _file: std::fs::File,
+}
+
+fn lock_folder(folder: &Path) -> Result<StoreLock, StoreError> {
+    let path = folder.join("lock");
+    let file = std::fs::File::create(&path).map_err(|source| StoreError::File {
+        path: path.clone(),
+        source,
+    })?;
+    match file.try_lock() {
+        Ok(()) => Ok(StoreLock { _file: file }),
+        Err(std::fs::TryLockError::WouldBlock) => Err(StoreError::InUse { path }),
+        Err(std::fs::TryLockError::Error(source)) => Err(StoreError::File { path, source }),
     }
 }
 

@@ -275,7 +275,7 @@ impl Bench {
         self.until("ready", |snapshot| snapshot.state == State::Ready)
     }
 
-    fn start(&self, serial: &str) -> Result<Inspection, (Refusal, Option<Inspection>)> {
+    fn start(&self, serial: &str) -> Result<Inspection, (Refusal, Option<Box<Inspection>>)> {
         self.start_as(serial, None, Mode::Single)
     }
 
@@ -284,7 +284,7 @@ impl Bench {
         serial: &str,
         key: Option<&str>,
         mode: Mode,
-    ) -> Result<Inspection, (Refusal, Option<Inspection>)> {
+    ) -> Result<Inspection, (Refusal, Option<Box<Inspection>>)> {
         let order = Order {
             part_serial: serial.to_owned(),
             ..Order::default()
@@ -660,7 +660,8 @@ fn devices_are_busy_while_they_work() {
     bench.left.release();
     bench.ended(id);
     let snapshot = bench.ready();
-    assert_eq!(snapshot.devices[0].received, u64::from(PROFILES));
+    // A view is read until the others have come to their end too.
+    assert!(snapshot.devices[0].received >= u64::from(PROFILES));
 }
 
 #[test]

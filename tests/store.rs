@@ -724,7 +724,14 @@ fn a_backup_taken_while_others_write_is_a_store() {
         .expect_err("it is there already");
     assert!(matches!(exists, StoreError::Exists { .. }));
     let last = measure(&store, "C", Status::NotOk, 50);
-    drop(store);
+    let lock = store.lock().expect("a daemon's lock");
+    assert!(matches!(store.lock(), Err(StoreError::InUse { .. })));
+    let in_use = restore(&folder.join("backup"), &folder.join("store")).expect_err("a daemon runs");
+    assert!(
+        in_use.to_string().contains("stop that one first"),
+        "{in_use}"
+    );
+    drop((lock, store));
     restore(&folder.join("backup"), &folder.join("store")).expect("restored");
     let store = Store::open(&folder.join("store")).expect("the restored store");
     assert_eq!(

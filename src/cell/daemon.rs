@@ -21,7 +21,9 @@ use super::state::{Circumstances, Mode};
 use super::status::{DeviceState, DeviceStatus, JobStatus, Snapshot};
 use super::{CellError, State};
 use crate::config::Cell;
-use crate::store::{Finished, Inspection, Order, RecipeVersion, Retention, Store, StoreError};
+use crate::store::{
+    Finished, Inspection, Order, RecipeVersion, Retention, Store, StoreError, StoreLock,
+};
 
 /// How often the loop looks after what no event tells it.
 const TICK: Duration = Duration::from_secs(1);
@@ -95,7 +97,7 @@ pub enum Refusal {
 }
 
 /// What a trigger gets: the inspection it became, or the refusal, which is kept as an inspection too where the store can.
-pub type Started = Result<Inspection, (Refusal, Option<Inspection>)>;
+pub type Started = Result<Inspection, (Refusal, Option<Box<Inspection>>)>;
 
 /// Everything that can happen.
 pub(super) enum Event {
@@ -190,6 +192,7 @@ impl Daemon {
         options: DaemonOptions,
     ) -> Result<Self, CellError> {
         let now = SystemTime::now();
+        let lock = store.lock()?;
         let reason = "the daemon ended before it was done; raw data up to there are kept, measure the part again";
         for inspection in store.recover(reason, now)? {
             tracing::warn!(
@@ -260,6 +263,7 @@ impl Daemon {
             computing: Vec::new(),
             work: Some(work),
             swept: None,
+            _lock: lock,
             ending: false,
             snapshot,
             publisher,
@@ -432,6 +436,7 @@ struct Running {
     computing: Vec<Job>,
     work: Option<Sender<Work>>,
     swept: Option<Instant>,
+    _lock: StoreLock,
     ending: bool,
     snapshot: Snapshot,
     publisher: watch::Sender<Arc<Snapshot>>,
@@ -628,7 +633,7 @@ impl Running {
             return match kept {
                 // The trigger was repeated, and taken the first time.
                 Ok(known) if known.phase != crate::store::Phase::Refused => Ok(known),
-                Ok(refused) => Err((refusal, Some(refused))),
+                Ok(refused) => Err((refusal, Some(Box::new(refused)))),
                 Err(_) => Err((refusal, None)),
             };
         }

@@ -25,19 +25,25 @@ pub(super) struct Prepared {
 /// [`CellError::Store`] only; a recipe that cannot be read is [`Prepared::problem`].
 pub(super) fn prepare(cell: &Cell, store: &Store, now: SystemTime) -> Result<Prepared, CellError> {
     let mut problem = String::new();
-    if let Err(error) = take(cell, store, now) {
-        if let CellError::Store(_) = error {
-            return Err(error);
+    let mut taken = None;
+    match take(cell, store, now) {
+        Ok(read) => taken = read,
+        Err(CellError::Store(error)) => return Err(error.into()),
+        Err(error) => {
+            problem = chain(&error);
+            tracing::error!(
+                error = problem,
+                "the configured recipe; the last good one stays active"
+            );
         }
-        problem = chain(&error);
-        tracing::error!(
-            error = problem,
-            "the configured recipe; the last good one stays active"
-        );
     }
-    let active = match store.active_recipe()? {
-        None => None,
-        Some(content) => match load(&content) {
+    let active = match (store.active_recipe()?, taken) {
+        (None, _) => None,
+        // A nominal takes a while to read: once is enough.
+        (Some(content), Some((id, part))) if content.version.id == id => {
+            Some((Arc::new(part), content.version))
+        }
+        (Some(content), _) => match load(&content) {
             Ok(part) => Some((Arc::new(part), content.version)),
             Err(error) => {
                 problem = chain(&error);
@@ -48,7 +54,8 @@ pub(super) fn prepare(cell: &Cell, store: &Store, now: SystemTime) -> Result<Pre
     Ok(Prepared { active, problem })
 }
 
-fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<(), CellError> {
+/// Takes the configured files into the store and activates them where they are new there; then they have been read as well.
+fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<Option<(i64, Part)>, CellError> {
     let read = |path: &std::path::Path| {
         std::fs::read(path).map_err(|source| CellError::RecipeFile {
             path: path.to_owned(),
@@ -58,18 +65,11 @@ fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<(), CellError> {
     let nominal = read(&cell.nominal)?;
     let (text, place) = match &cell.recipe {
         None => (String::new(), String::new()),
-        Some(path) => {
-            let bytes = read(path)?;
-            (
-                String::from_utf8_lossy(&bytes).into_owned(),
-                path.display().to_string(),
-            )
-        }
+        Some(path) => (
+            String::from_utf8_lossy(&read(path)?).into_owned(),
+            path.display().to_string(),
+        ),
     };
-    let known = store.recipes()?.len();
-    // Checked before it is taken: what the store holds can be read.
-    check_recipe(&text, &place)?;
-    read_nominal(&cell.nominal)?;
     let name = cell
         .nominal
         .file_stem()
@@ -88,12 +88,19 @@ fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<(), CellError> {
         author: "configuration",
         why: "the configured files",
     };
-    let version = store.add_recipe(&new, now)?;
-    let is_new = store.recipes()?.len() > known;
-    if is_new || store.active_recipe()?.is_none() {
-        store.activate_recipe(version.id, "configuration", "the configured files", now)?;
+    let known = store.known_recipe(&new)?;
+    if known && store.active_recipe()?.is_some() {
+        return Ok(None);
     }
-    Ok(())
+    // Checked before it is taken: what the store holds can be read.
+    let part = Part {
+        recipe: check_recipe(&text, &place)?,
+        nominal: read_nominal(&cell.nominal)?,
+        nominal_name: nominal_name.to_string(),
+    };
+    let version = store.add_recipe(&new, now)?;
+    store.activate_recipe(version.id, new.author, new.why, now)?;
+    Ok(Some((version.id, part)))
 }
 
 /// Reads a version.

@@ -1,8 +1,8 @@
-//! The history for those who analyse elsewhere: CSV, JSON lines.
+//! The history for those who analyse elsewhere: CSV, JSON lines, and Parquet where it is built in.
 
 use std::io::{self, Write};
 
-use super::{History, Store, StoreError};
+use super::{History, Inspection, Store, StoreError};
 use crate::report::Report;
 
 /// In which form.
@@ -12,6 +12,9 @@ pub enum Export {
     Csv,
     /// One inspection with its whole report a line.
     JsonLines,
+    /// One Parquet table, a row for each station.
+    #[cfg(feature = "parquet")]
+    Parquet,
 }
 
 /// Why an export did not come to its end.
@@ -26,6 +29,10 @@ pub enum ExportError {
     /// Where it was to go, for a table.
     #[error("the export cannot be written: {0}")]
     Csv(#[from] csv::Error),
+    /// Where it was to go, for Parquet.
+    #[cfg(feature = "parquet")]
+    #[error("the export cannot be written: {0}")]
+    Parquet(#[from] ::parquet::errors::ParquetError),
 }
 
 /// Inspections read at a time.
@@ -40,50 +47,62 @@ impl Store {
         &self,
         form: Export,
         history: &History,
-        out: &mut dyn Write,
+        out: &mut (dyn Write + Send),
     ) -> Result<u64, ExportError> {
-        let mut table = csv::Writer::from_writer(Vec::new());
-        if form == Export::Csv {
-            table.write_record(HEADINGS)?;
-        }
+        let written = match form {
+            Export::JsonLines => self.each_report(history, &mut |inspection, json| {
+                let head = serde_json::to_string(inspection).unwrap_or_default();
+                Ok(writeln!(
+                    out,
+                    "{{\"inspection\":{head},\"report\":{json}}}"
+                )?)
+            })?,
+            Export::Csv => {
+                let mut table = csv::Writer::from_writer(&mut *out);
+                table.write_record(HEADINGS)?;
+                let written =
+                    self.each_report(
+                        history,
+                        &mut |inspection, json| match serde_json::from_str::<Report>(json) {
+                            Ok(report) => Ok(rows(&mut table, inspection, &report)?),
+                            Err(_) => Ok(()),
+                        },
+                    )?;
+                table.flush()?;
+                written
+            }
+            #[cfg(feature = "parquet")]
+            Export::Parquet => self.export_parquet(history, out)?,
+        };
+        out.flush()?;
+        Ok(written)
+    }
+
+    /// Shows every inspection that has a report, and the report's JSON, to `show`; says how many there were.
+    pub(super) fn each_report(
+        &self,
+        history: &History,
+        show: &mut dyn FnMut(&Inspection, &str) -> Result<(), ExportError>,
+    ) -> Result<u64, ExportError> {
         let mut page = History {
             limit: Some(PAGE),
             ..history.clone()
         };
-        let mut written = 0;
+        let mut shown = 0;
         loop {
             let inspections = self.history(&page)?;
             let Some(last) = inspections.last() else {
-                break;
+                return Ok(shown);
             };
             page.before = Some(last.id);
             for inspection in &inspections {
                 // An inspection without a result has no report.
-                let Ok(json) = self.report_json(inspection.id) else {
-                    continue;
-                };
-                written += 1;
-                match form {
-                    Export::JsonLines => {
-                        let head = serde_json::to_string(inspection).unwrap_or_default();
-                        writeln!(out, "{{\"inspection\":{head},\"report\":{json}}}")?;
-                    }
-                    Export::Csv => {
-                        let Ok(report) = serde_json::from_str::<Report>(&json) else {
-                            continue;
-                        };
-                        rows(&mut table, inspection, &report)?;
-                        table.flush()?;
-                        out.write_all(table.get_ref())?;
-                        table = csv::Writer::from_writer(Vec::new());
-                    }
+                if let Ok(json) = self.report_json(inspection.id) {
+                    show(inspection, &json)?;
+                    shown += 1;
                 }
             }
         }
-        table.flush()?;
-        out.write_all(table.get_ref())?;
-        out.flush()?;
-        Ok(written)
     }
 }
 
@@ -106,9 +125,9 @@ const HEADINGS: [&str; 16] = [
     "characteristic_verdict",
 ];
 
-fn rows(
-    table: &mut csv::Writer<Vec<u8>>,
-    inspection: &super::Inspection,
+fn rows<W: Write>(
+    table: &mut csv::Writer<W>,
+    inspection: &Inspection,
     report: &Report,
 ) -> csv::Result<()> {
     let number = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());

@@ -63,6 +63,17 @@ pub struct NewRecipe<'a> {
     pub why: &'a str,
 }
 
+impl NewRecipe<'_> {
+    /// As [`RecipeVersion::sha256`].
+    fn sha256(&self) -> String {
+        let mut content = Sha256::new();
+        content.update(self.text.as_bytes());
+        content.update([0]);
+        content.update(self.nominal);
+        hex(&content.finalize())
+    }
+}
+
 const COLUMNS: &str = "id, name, version, sha256, nominal_name, nominal_sha256, author, why, created_ms,
     id = coalesce((SELECT CAST(value AS INTEGER) FROM settings WHERE settings.name = 'active_recipe'), 0)";
 
@@ -77,11 +88,7 @@ impl Store {
         at: SystemTime,
     ) -> Result<RecipeVersion, StoreError> {
         let nominal_sha256 = hex(&Sha256::digest(new.nominal));
-        let mut content = Sha256::new();
-        content.update(new.text.as_bytes());
-        content.update([0]);
-        content.update(new.nominal);
-        let sha256 = hex(&content.finalize());
+        let sha256 = new.sha256();
         let path = self.nominal_path(&nominal_sha256, new.nominal_name);
         if !path.is_file() {
             crate::points::write::write_atomically(&path, new.nominal).map_err(|error| {
@@ -130,6 +137,20 @@ impl Store {
             let version = one(&transaction, id)?;
             transaction.commit()?;
             Ok(version.0)
+        })
+    }
+
+    /// Whether this content was ever added under this name.
+    ///
+    /// # Errors
+    /// [`StoreError::Database`].
+    pub fn known_recipe(&self, new: &NewRecipe<'_>) -> Result<bool, StoreError> {
+        self.read(|connection| {
+            connection.query_row(
+                "SELECT EXISTS (SELECT 1 FROM recipes WHERE name = ?1 AND sha256 = ?2)",
+                [new.name, &new.sha256()],
+                |row| row.get(0),
+            )
         })
     }
 

@@ -262,10 +262,9 @@ fn copy_files(from: &Path, to: &Path) -> Result<(), StoreError> {
 }
 
 /// Puts the backup in `backup` where the store in `target` was; the old one stays beside it as `NAME.before-restore`.
-/// No daemon may be running on `target`.
 ///
 /// # Errors
-/// [`StoreError`]; `target` is untouched where the backup cannot be read.
+/// [`StoreError::InUse`] where a daemon runs on `target`, and what else keeps it from being done; `target` is untouched where the backup cannot be read.
 pub fn restore(backup: &Path, target: &Path) -> Result<(), StoreError> {
     let database = backup.join("acies.db");
     let checked = Connection::open_with_flags(&database, OpenFlags::SQLITE_OPEN_READ_ONLY)
@@ -286,6 +285,11 @@ pub fn restore(backup: &Path, target: &Path) -> Result<(), StoreError> {
             });
         }
     }
+    let taken = if target.is_dir() {
+        Some(super::lock_folder(target)?)
+    } else {
+        None
+    };
     let mut coming = target.as_os_str().to_owned();
     coming.push(".restoring");
     let coming = PathBuf::from(coming);
@@ -311,5 +315,7 @@ pub fn restore(backup: &Path, target: &Path) -> Result<(), StoreError> {
     if target.exists() {
         fs::rename(target, &before).map_err(at(target))?;
     }
-    fs::rename(&coming, target).map_err(at(target))
+    fs::rename(&coming, target).map_err(at(target))?;
+    drop(taken);
+    Ok(())
 }

@@ -1,0 +1,177 @@
+//! `cargo bench --bench store [-- INSPECTIONS]`: how long questions to the history take when a million inspections are stored.
+//!
+//! The rows are written as the store writes them, twenty characteristics each, in large transactions and not one by one: making
+//! a million durable commits would take hours and tell nothing about questions.
+
+#![allow(clippy::print_stdout)] // what a bench is for
+
+use std::time::{Duration, Instant, SystemTime};
+
+use acies::report::wire::Status;
+use acies::store::{Audit, History, Order, Store};
+
+fn main() {
+    let count: i64 = std::env::args()
+        .filter_map(|a| a.parse().ok())
+        .next()
+        .unwrap_or(1_000_000);
+    let folder = std::env::temp_dir().join(format!("acies-history-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    let store = Store::open(&folder).expect("a store");
+    fill(&folder.join("acies.db"), count);
+    let size = std::fs::metadata(folder.join("acies.db")).map_or(0, |m| m.len());
+    println!(
+        "{count} inspections, {} MB, {:.0} bytes each",
+        size / 1_000_000,
+        size as f64 / count as f64
+    );
+    let any = History::default;
+    let questions: [(&str, &dyn Fn()); 8] = [
+        ("newest page", &|| {
+            drop(store.history(&any()).expect("a page"))
+        }),
+        ("page in the middle", &|| {
+            drop(
+                store
+                    .history(&History {
+                        before: Some(count / 2),
+                        ..any()
+                    })
+                    .expect("a page"),
+            );
+        }),
+        ("one part", &|| {
+            let part_serial = Some(format!("P-{}", count / 3));
+            drop(
+                store
+                    .history(&History {
+                        part_serial,
+                        ..any()
+                    })
+                    .expect("a page"),
+            );
+        }),
+        ("not OK, the oldest", &|| {
+            let history = History {
+                verdict: Some(Status::NotOk),
+                before: Some(count / 10),
+                ..any()
+            };
+            drop(store.history(&history).expect("a page"));
+        }),
+        ("an order that is not there", &|| {
+            let order_number = Some("none".to_owned());
+            drop(
+                store
+                    .history(&History {
+                        order_number,
+                        ..any()
+                    })
+                    .expect("a page"),
+            );
+        }),
+        ("trend of 500", &|| {
+            drop(store.trend("e7.d1", 500, false).expect("a trend"))
+        }),
+        ("usage", &|| {
+            store.usage().expect("usage");
+        }),
+        ("one inspection", &|| {
+            drop(store.inspection(count / 2).expect("it"))
+        }),
+    ];
+    for (name, ask) in questions {
+        let mut times: Vec<Duration> = (0..200)
+            .map(|_| {
+                let began = Instant::now();
+                ask();
+                began.elapsed()
+            })
+            .collect();
+        times.sort();
+        println!(
+            "{name:<28} median {:>9.2?}  worst {:>9.2?}",
+            times[100], times[199]
+        );
+    }
+    let mut commits: Vec<Duration> = (0..200)
+        .map(|number| {
+            let began = Instant::now();
+            let order = Order {
+                part_serial: format!("N-{number}"),
+                ..Order::default()
+            };
+            store
+                .queue(&order, "bench", None, SystemTime::now())
+                .expect("queued");
+            began.elapsed()
+        })
+        .collect();
+    commits.sort();
+    println!(
+        "{:<28} median {:>9.2?}  worst {:>9.2?}",
+        "a durable commit", commits[100], commits[199]
+    );
+    let entry = Audit {
+        person: "bench",
+        action: "bench",
+        subject: "",
+        old: "",
+        new: "",
+        why: "",
+    };
+    store.audit(&entry, SystemTime::now()).expect("written");
+    let _ = std::fs::remove_dir_all(&folder);
+}
+
+fn fill(path: &std::path::Path, count: i64) {
+    let mut database = rusqlite::Connection::open(path).expect("the database");
+    database
+        .execute_batch("PRAGMA synchronous = OFF; PRAGMA cache_size = -400000;")
+        .expect("settings");
+    let transaction = database.transaction().expect("a transaction");
+    {
+        for number in 1..=20 {
+            let name = format!("e{number}.d1");
+            transaction
+                .execute(
+                    "INSERT INTO characteristics (id, name, unit) VALUES (?1, ?2, 'mm')",
+                    (number, name),
+                )
+                .expect("a name");
+        }
+        let mut inspection = transaction
+            .prepare(
+                "INSERT INTO inspections (phase, part_serial, order_number, purpose, operator, requested_ms, started_ms, acquired_ms,
+                 ended_ms, verdict, reason, points, scan_seconds, verdict_seconds, scan_file, scan_bytes, scan_whole)
+                 VALUES ('done', ?1, ?2, 'series', 'anna', ?3, ?3, ?3, ?3, ?4, 'all values lie within their limits', 2000000, 10.0, 0.5, ?5, 20000000, 1)",
+            )
+            .expect("a statement");
+        let mut measured = transaction
+            .prepare("INSERT INTO measured VALUES (?1, ?2, ?3, 0.001, -0.05, 0.05, 'ok')")
+            .expect("a statement");
+        for id in 1..=count {
+            let verdict = match id % 20 {
+                0 => "not_ok",
+                1 => "not_decidable",
+                _ => "ok",
+            };
+            let order = format!("O-{}", id / 500);
+            inspection
+                .execute((
+                    format!("P-{id}"),
+                    order,
+                    1_700_000_000_000 + id * 30_000,
+                    verdict,
+                    format!("{id:08}.raw"),
+                ))
+                .expect("a row");
+            for characteristic in 1..=20 {
+                measured
+                    .execute((characteristic, id, (id % 97) as f64 * 1e-3))
+                    .expect("a value");
+            }
+        }
+    }
+    transaction.commit().expect("committed");
+}
