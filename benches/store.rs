@@ -26,7 +26,7 @@ fn main() {
         size as f64 / count as f64
     );
     let any = History::default;
-    let questions: [(&str, &dyn Fn()); 8] = [
+    let questions: [(&str, &dyn Fn()); 10] = [
         ("newest page", &|| {
             drop(store.history(&any()).expect("a page"))
         }),
@@ -70,6 +70,28 @@ fn main() {
                     .expect("a page"),
             );
         }),
+        ("parts that begin with P-77", &|| {
+            let serial_prefix = Some("P-77".to_owned());
+            drop(
+                store
+                    .history(&History {
+                        serial_prefix,
+                        ..any()
+                    })
+                    .expect("a page"),
+            );
+        }),
+        ("parts that begin with P", &|| {
+            let serial_prefix = Some("P".to_owned());
+            drop(
+                store
+                    .history(&History {
+                        serial_prefix,
+                        ..any()
+                    })
+                    .expect("a page"),
+            );
+        }),
         ("trend of 500", &|| {
             drop(store.trend("e7.d1", 500, false).expect("a trend"))
         }),
@@ -102,7 +124,15 @@ fn main() {
                 ..Order::default()
             };
             store
-                .queue(&order, "bench", None, SystemTime::now())
+                .queue(
+                    &acies::store::Trigger {
+                        order: &order,
+                        operator: "bench",
+                        key: None,
+                        simulated: true,
+                    },
+                    SystemTime::now(),
+                )
                 .expect("queued");
             began.elapsed()
         })

@@ -24,7 +24,7 @@ use utoipa::ToSchema;
 
 pub use export::{Export, ExportError};
 pub use inspections::{
-    Finished, History, Inspection, Measured, Order, Phase, Purpose, Trend, TrendPoint,
+    Finished, History, Inspection, Measured, Order, Phase, Purpose, Trend, TrendPoint, Trigger,
 };
 pub use people::{Person, Role, Session, SessionKind};
 pub use recipes::{NewRecipe, RecipeContent, RecipeVersion};

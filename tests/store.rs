@@ -14,7 +14,7 @@ use acies::report::Report;
 use acies::report::wire::Status;
 use acies::store::{
     Audit, Export, Finished, History, NewRecipe, Order, Phase, Purpose, Retention, Role,
-    ScanReader, ScanWriter, SessionKind, Store, StoreError, StoredView, restore,
+    ScanReader, ScanWriter, SessionKind, Store, StoreError, StoredView, Trigger, restore,
 };
 use acies_drivers::capture::Profile;
 use acies_drivers::device::Identity;
@@ -55,6 +55,16 @@ fn order(part_serial: &str) -> Order {
     }
 }
 
+/// A trigger of Anna's.
+fn trigger<'a>(order: &'a Order, key: Option<&'a str>) -> Trigger<'a> {
+    Trigger {
+        order,
+        operator: "anna",
+        key,
+        simulated: false,
+    }
+}
+
 /// The report of the report's own tests, with another verdict.
 fn report(verdict: Status) -> Report {
     let mut report = Report::new(&part::inspection(4), &part::facts());
@@ -65,7 +75,7 @@ fn report(verdict: Status) -> Report {
 
 fn measure(store: &Store, serial: &str, verdict: Status, seconds: u64) -> i64 {
     let (inspection, _) = store
-        .queue(&order(serial), "anna", None, at(seconds))
+        .queue(&trigger(&order(serial), None), at(seconds))
         .expect("queued");
     let id = inspection.id;
     store
@@ -183,16 +193,16 @@ fn a_trigger_that_is_repeated_measures_once() {
     let folder = Folder::new("idempotent");
     let store = Store::open(&folder.0).expect("a store");
     let (first, new) = store
-        .queue(&order("A"), "anna", Some("key-1"), at(0))
+        .queue(&trigger(&order("A"), Some("key-1")), at(0))
         .expect("queued");
     let (again, new_again) = store
-        .queue(&order("A"), "anna", Some("key-1"), at(9))
+        .queue(&trigger(&order("A"), Some("key-1")), at(9))
         .expect("queued");
     let (other, _) = store
-        .queue(&order("A"), "anna", None, at(9))
+        .queue(&trigger(&order("A"), None), at(9))
         .expect("queued");
     let (another, _) = store
-        .queue(&order("A"), "anna", None, at(9))
+        .queue(&trigger(&order("A"), None), at(9))
         .expect("queued");
     assert!(new && !new_again);
     assert_eq!(first, again);
@@ -208,7 +218,7 @@ fn a_part_measured_again_keeps_its_first_result() {
         remeasure_of: Some(first),
         ..order("A")
     };
-    let (second, _) = store.queue(&repeat, "anna", None, at(5)).expect("queued");
+    let (second, _) = store.queue(&trigger(&repeat, None), at(5)).expect("queued");
     assert_eq!(second.remeasure_of, Some(first));
     assert!(store.report_json(first).is_ok());
     let nothing = Order {
@@ -216,7 +226,7 @@ fn a_part_measured_again_keeps_its_first_result() {
         ..order("A")
     };
     let refused = store
-        .queue(&nothing, "anna", None, at(6))
+        .queue(&trigger(&nothing, None), at(6))
         .expect_err("no such inspection");
     assert!(matches!(refused, StoreError::Missing { .. }), "{refused}");
 }
@@ -263,6 +273,17 @@ fn pages_of_the_history_join_without_gap_or_overlap() {
         ..History::default()
     };
     assert_eq!(store.history(&of_part).expect("a page").len(), 8);
+    let found = |prefix: &str| {
+        let history = History {
+            serial_prefix: Some(prefix.to_owned()),
+            ..History::default()
+        };
+        store.history(&history).expect("a page").len()
+    };
+    assert_eq!(
+        [found("P-"), found("P-3"), found("P-4"), found("p")],
+        [31, 7, 0, 0]
+    );
 }
 
 #[test]
@@ -272,12 +293,13 @@ fn a_trend_holds_series_parts_on_real_instruments_only() {
     let counted = measure(&store, "A", Status::Ok, 0);
     let (setup, _) = store
         .queue(
-            &Order {
-                purpose: Purpose::Setup,
-                ..order("B")
-            },
-            "anna",
-            None,
+            &trigger(
+                &Order {
+                    purpose: Purpose::Setup,
+                    ..order("B")
+                },
+                None,
+            ),
             at(5),
         )
         .expect("queued");
@@ -289,7 +311,7 @@ fn a_trend_holds_series_parts_on_real_instruments_only() {
     };
     store.finish(setup.id, &finished, at(6)).expect("finished");
     let (simulated, _) = store
-        .queue(&order("C"), "anna", None, at(7))
+        .queue(&trigger(&order("C"), None), at(7))
         .expect("queued");
     let mut played = report(Status::Ok);
     played.simulated = true;
@@ -576,7 +598,7 @@ fn what_a_crash_left_is_aborted_with_its_raw_data() {
     let done = measure(&store, "A", Status::Ok, 0);
     let begin = |serial: &str| {
         let (inspection, _) = store
-            .queue(&order(serial), "anna", None, at(10))
+            .queue(&trigger(&order(serial), None), at(10))
             .expect("queued");
         let name = format!("{:08}.raw", inspection.id);
         store
@@ -599,7 +621,7 @@ fn what_a_crash_left_is_aborted_with_its_raw_data() {
         .expect("placed, and the crash comes before that is noted");
     let (empty, _) = begin("D");
     let (waiting, _) = store
-        .queue(&order("E"), "anna", None, at(12))
+        .queue(&trigger(&order("E"), None), at(12))
         .expect("queued");
     drop(store);
 
@@ -755,7 +777,7 @@ fn exports_hold_every_characteristic_of_every_result() {
         measure(&store, &format!("A, \"{number}\""), Status::Ok, number);
     }
     store
-        .refuse(&order("B"), "anna", None, "not ready", at(9))
+        .refuse(&trigger(&order("B"), None), "not ready", at(9))
         .expect("kept");
     let report = report(Status::Ok);
     let values: Vec<_> = report

@@ -22,7 +22,7 @@ use super::status::{DeviceState, DeviceStatus, JobStatus, Snapshot};
 use super::{CellError, State};
 use crate::config::Cell;
 use crate::store::{
-    Finished, Inspection, Order, RecipeVersion, Retention, Store, StoreError, StoreLock,
+    Finished, Inspection, Order, RecipeVersion, Retention, Store, StoreError, StoreLock, Trigger,
 };
 
 /// How often the loop looks after what no event tells it.
@@ -625,11 +625,15 @@ impl Running {
             admitted = admitted.and(Err(Refusal::NoSerial));
         }
         let now = SystemTime::now();
+        let trigger = Trigger {
+            order: &order,
+            operator,
+            key,
+            simulated: self.options.simulated,
+        };
         let failed = |error: StoreError| (Refusal::Store(chain(&error)), None);
         if let Err(refusal) = admitted {
-            let kept = self
-                .store
-                .refuse(&order, operator, key, &refusal.to_string(), now);
+            let kept = self.store.refuse(&trigger, &refusal.to_string(), now);
             return match kept {
                 // The trigger was repeated, and taken the first time.
                 Ok(known) if known.phase != crate::store::Phase::Refused => Ok(known),
@@ -637,10 +641,7 @@ impl Running {
                 Err(_) => Err((refusal, None)),
             };
         }
-        let (inspection, new) = self
-            .store
-            .queue(&order, operator, key, now)
-            .map_err(failed)?;
+        let (inspection, new) = self.store.queue(&trigger, now).map_err(failed)?;
         if !new {
             return Ok(inspection);
         }
@@ -771,7 +772,13 @@ impl Running {
             part_serial: format!("{}-{count}", order.part_serial),
             ..order.clone()
         };
-        match self.store.queue(&next, operator, None, SystemTime::now()) {
+        let trigger = Trigger {
+            order: &next,
+            operator,
+            key: None,
+            simulated: self.options.simulated,
+        };
+        match self.store.queue(&trigger, SystemTime::now()) {
             Ok((inspection, _)) => self.queue.push_back(Job::new(&inspection)),
             Err(error) => self.fault = Some(chain(&error)),
         }

@@ -41,6 +41,19 @@ pub struct Order {
     pub remeasure_of: Option<i64>,
 }
 
+/// Somebody's press on Start.
+#[derive(Debug, Clone, Copy)]
+pub struct Trigger<'a> {
+    /// What is asked for.
+    pub order: &'a Order,
+    /// Who asks.
+    pub operator: &'a str,
+    /// Names the trigger: when it is repeated with the same key, the same inspection is meant.
+    pub key: Option<&'a str>,
+    /// Whether the instruments are simulated.
+    pub simulated: bool,
+}
+
 /// Where an inspection stands.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
 #[serde(rename_all = "snake_case")]
@@ -140,6 +153,8 @@ pub struct History {
     pub limit: Option<u32>,
     /// Only of this part.
     pub part_serial: Option<String>,
+    /// Only of parts whose serial number begins so.
+    pub serial_prefix: Option<String>,
     /// Only of this production order.
     pub order_number: Option<String>,
     /// Only with this verdict: ok, not_ok, not_decidable, undefined.
@@ -215,46 +230,40 @@ const COLUMNS: &str = "id, phase, part_serial, order_number, purpose, operator, 
 const PAGE_MAX: u32 = 500;
 
 impl Store {
-    /// Takes an order into the queue. The same `key` gives the same inspection again: a trigger that was repeated because its
-    /// answer got lost measures once.
+    /// Takes an order into the queue, and says whether it is new: a trigger that was repeated because its answer got lost
+    /// measures once.
     ///
     /// # Errors
     /// [`StoreError::Database`]; [`StoreError::Missing`] where it repeats an inspection that is not there.
     pub fn queue(
         &self,
-        order: &Order,
-        operator: &str,
-        key: Option<&str>,
+        trigger: &Trigger<'_>,
         at: SystemTime,
     ) -> Result<(Inspection, bool), StoreError> {
-        self.ask(order, operator, key, Phase::Queued, "", at)
+        self.ask(trigger, Phase::Queued, "", at)
     }
 
-    /// Keeps an order that could not be taken, with the reason.
+    /// Keeps an order that could not be taken, with the reason; or finds the one that was taken under the same key.
     ///
     /// # Errors
     /// As [`Store::queue`].
     pub fn refuse(
         &self,
-        order: &Order,
-        operator: &str,
-        key: Option<&str>,
+        trigger: &Trigger<'_>,
         reason: &str,
         at: SystemTime,
     ) -> Result<Inspection, StoreError> {
-        let asked = self.ask(order, operator, key, Phase::Refused, reason, at)?;
-        Ok(asked.0)
+        Ok(self.ask(trigger, Phase::Refused, reason, at)?.0)
     }
 
     fn ask(
         &self,
-        order: &Order,
-        operator: &str,
-        key: Option<&str>,
+        trigger: &Trigger<'_>,
         phase: Phase,
         reason: &str,
         at: SystemTime,
     ) -> Result<(Inspection, bool), StoreError> {
+        let order = trigger.order;
         if let Some(first) = order.remeasure_of {
             self.inspection(first)?;
         }
@@ -263,7 +272,7 @@ impl Store {
             let known: Option<i64> = transaction
                 .query_row(
                     "SELECT id FROM inspections WHERE idempotency_key = ?1",
-                    [key],
+                    [trigger.key],
                     |row| row.get(0),
                 )
                 .optional()?;
@@ -273,15 +282,17 @@ impl Store {
                     let ended = (phase == Phase::Refused).then(|| millis(at));
                     transaction.execute(
                         "INSERT INTO inspections (phase, part_serial, order_number, purpose, operator, idempotency_key,
-                         remeasure_of, requested_ms, ended_ms, reason) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10)",
+                         remeasure_of, simulated, requested_ms, ended_ms, reason)
+                         VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11)",
                         params![
                             phase.word(),
                             order.part_serial,
                             order.order_number,
                             purpose_word(order.purpose),
-                            operator,
-                            key,
+                            trigger.operator,
+                            trigger.key,
                             order.remeasure_of,
+                            trigger.simulated,
                             millis(at),
                             ended,
                             reason
@@ -441,6 +452,15 @@ impl Store {
             "verdict",
             history.verdict.map(|v| status_word(v).to_owned()),
         );
+        if let Some(prefix) = &history.serial_prefix {
+            values.push(Box::new(prefix.clone()));
+            let n = values.len();
+            // The serial numbers stand beside each other in their index.
+            conditions.push(format!(
+                "id IN (SELECT id FROM inspections INDEXED BY inspections_by_serial WHERE part_serial >= ?{n}
+                 AND part_serial < ?{n} || char(1114111) AND id < ?1)"
+            ));
+        }
         let sql = format!(
             "SELECT {COLUMNS} FROM inspections WHERE {} ORDER BY id DESC LIMIT {limit}",
             conditions.join(" AND ")
