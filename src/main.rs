@@ -1,5 +1,6 @@
 //! The `acies` program: reads the command line, sets up logs, and turns a failure into words and an exit status.
 
+use std::io::IsTerminal;
 use std::process::ExitCode;
 
 use acies::cli::{Command, Failure};
@@ -46,10 +47,18 @@ fn main() -> ExitCode {
         eprintln!("acies: --log {log:?} is no level; expected one such as info, or acies=debug");
         return ExitCode::from(64);
     };
-    let to_standard_error = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    // Under systemd the journal takes the fields as they are; elsewhere people read lines.
+    let under_systemd = std::env::var_os("JOURNAL_STREAM").is_some();
+    let journal = under_systemd.then(tracing_journald::layer).and_then(Result::ok);
+    let lines = journal.is_none().then(|| {
+        tracing_subscriber::fmt::layer()
+            .with_writer(std::io::stderr)
+            .with_ansi(std::io::stderr().is_terminal())
+    });
     tracing_subscriber::registry()
         .with(filter)
-        .with(to_standard_error)
+        .with(journal)
+        .with(lines)
         .init();
     match arguments.command.run() {
         Ok(status) => status.into(),
