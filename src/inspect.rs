@@ -12,9 +12,11 @@ mod collect;
 pub mod compare;
 mod contributions;
 pub mod corner;
+pub mod datums;
 mod edge_break;
 pub mod flank;
 pub mod form;
+mod from_pmi;
 pub mod gap;
 pub mod measure;
 pub mod monte_carlo;
@@ -39,7 +41,7 @@ use body::BodyEdge;
 use characteristic::{EdgeValues, at_station, characteristics};
 use corner::CornerSettings;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges_stepped};
-use quantity::Quantity;
+use quantity::{Limits, Quantity};
 use recipe::{EdgeFacts, EdgeKey, Resolved};
 use result::{EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
 use verdict::judge;
@@ -93,18 +95,29 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let surface = Surface::new(nominal);
     let mut findings = Vec::new();
     let datums = datum_faces(nominal, &request.recipe.datum_faces, &mut findings);
+    let (features, unknown) = datums::datum_features(nominal, &request.recipe.datums);
+    findings.extend(unknown.iter().map(|datum| {
+        format!(
+            "recipe: alignment: datum {:?}: {}, expected {}; nothing is decided without it",
+            datum.name, datum.found, datum.expected
+        )
+    }));
     let options = AlignOptions {
         datum_faces: &datums,
+        datums: if unknown.is_empty() { &features } else { &[] },
         touches: request.touches,
         held: request.recipe.held,
         ..AlignOptions::default()
     };
     let Aligned {
-        alignment,
+        mut alignment,
         findings: of_alignment,
         ..
     } = align(&scan, &surface, request.start, &options);
     findings.extend(of_alignment);
+    if !unknown.is_empty() {
+        alignment.status = Verdict::NotDecidable;
+    }
 
     stages.begin("faces of the points");
     let pose = alignment.part_from_machine;
@@ -125,7 +138,8 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         expansion: expansion(request, &mut findings),
     };
     let facts = all_edge_facts(nominal);
-    let resolved = resolve(&facts, request.recipe, &mut findings);
+    let (resolved, of_recipe) = resolve(nominal, &facts, request.recipe);
+    findings.extend(of_recipe);
     let steps: Vec<Option<f64>> = resolved.iter().map(|r| r.station_step_mm).collect();
     let measured = measure_edges_stepped(&part, &places, &surface, &settings, &steps);
     stages.begin("comparison of edges found");
@@ -215,8 +229,14 @@ fn edge_facts<B: Body>(nominal: &B, index: usize, edge: &BodyEdge) -> EdgeFacts 
     facts
 }
 
-/// What the recipe says of every edge; an entry that means none becomes a finding, a name for several gets their ids behind it.
-fn resolve(facts: &[EdgeFacts], recipe: &Recipe, findings: &mut Vec<String>) -> Vec<Resolved> {
+/// What holds for every edge of `facts`, by the recipe and where it asks for them by the nominal's own tolerances, and findings: an entry
+/// that means no edge, a tolerance that gives no limit. A name for several edges gets their ids behind it.
+pub fn resolve<B: Body>(
+    nominal: &B,
+    facts: &[EdgeFacts],
+    recipe: &Recipe,
+) -> (Vec<Resolved>, Vec<String>) {
+    let mut findings = Vec::new();
     for entry in &recipe.edges {
         if !facts.iter().any(|edge| entry.select.means(edge)) {
             findings.push(format!(
@@ -225,7 +245,17 @@ fn resolve(facts: &[EdgeFacts], recipe: &Recipe, findings: &mut Vec<String>) -> 
             ));
         }
     }
-    let mut resolved: Vec<Resolved> = facts.iter().map(|edge| recipe.of(edge)).collect();
+    let mut by_nominal = vec![Limits::default(); facts.len()];
+    if recipe.limits_from_pmi {
+        let (limits, unused) = from_pmi::limits_from_pmi(nominal, facts, &recipe.datums);
+        by_nominal = limits;
+        findings.extend(unused);
+    }
+    let mut resolved: Vec<Resolved> = facts
+        .iter()
+        .zip(by_nominal)
+        .map(|(edge, by_nominal)| recipe.of_edge(edge, by_nominal))
+        .collect();
     let names: Vec<Option<String>> = resolved.iter().map(|edge| edge.name.clone()).collect();
     for (edge, facts) in resolved.iter_mut().zip(facts) {
         let shared = names.iter().filter(|name| **name == edge.name).count() > 1;
@@ -233,7 +263,7 @@ fn resolve(facts: &[EdgeFacts], recipe: &Recipe, findings: &mut Vec<String>) -> 
             *name = format!("{name} {}", facts.id);
         }
     }
-    resolved
+    (resolved, findings)
 }
 
 /// Missing edges count where they have limits, unexpected ones where the recipe says so.

@@ -2,7 +2,7 @@
 //!
 //! Source: features-and-standards, section 5, characteristics 22 (worst point), 24 (statistics), 25 (verdict).
 
-use super::quantity::{Extent, Limits, Quantity};
+use super::quantity::{Extent, LimitSource, Limits, Quantity};
 use super::recipe::Rule;
 use super::result::{BreakShape, EdgeBreak, EdgeForm, Quantified, StationResult, Verdict};
 use super::verdict::judge;
@@ -20,6 +20,8 @@ pub struct Characteristic {
     pub s_mm: Option<f64>,
     /// Lower and upper limit.
     pub limits: Option<[f64; 2]>,
+    /// Where they come from.
+    pub limits_from: Option<LimitSource>,
     /// Worst verdict of all its values.
     pub verdict: Verdict,
     /// Why it has no value, or why it is not decidable; empty otherwise.
@@ -73,10 +75,14 @@ pub struct EdgeValues<'a> {
 pub fn characteristics(edge: &EdgeValues<'_>, limits: &Limits, rule: Rule) -> Vec<Characteristic> {
     Quantity::all()
         .filter_map(|quantity| {
+            let source = limits.source(quantity);
             let limits = limits.of(quantity);
             let samples = samples(edge, quantity);
             let wanted = always(quantity) || !samples.is_empty() || limits.is_some();
-            wanted.then(|| of_samples(edge, quantity, &samples, limits, rule))
+            wanted.then(|| Characteristic {
+                limits_from: source,
+                ..of_samples(edge, quantity, &samples, limits, rule)
+            })
         })
         .collect()
 }
@@ -201,6 +207,7 @@ fn of_samples(
         value: worst.map(|worst| worst.value),
         s_mm: worst.and_then(|worst| worst.s_mm),
         limits,
+        limits_from: None,
         verdict,
         reason,
         statistics: statistics(samples.iter().map(|s| s.value.value), limits),

@@ -74,6 +74,79 @@ pub struct Alignment {
     pub weak_directions: Vec<String>,
     /// Ok, or NotDecidable with the reason in the findings.
     pub status: Verdict,
+    /// How the pose was found.
+    pub method: Method,
+    /// STEP entities of the faces that the best fit used; empty = all.
+    pub faces: Vec<u64>,
+    /// The datum features that the pose rests on.
+    pub datums: Vec<DatumResult>,
+    /// What they leave free, in words: there the pose is that of the best fit.
+    pub free_of_datums: Vec<String>,
+}
+
+impl Default for Alignment {
+    /// The identity, of which nothing is known.
+    fn default() -> Self {
+        Self {
+            part_from_machine: RigidTransform::IDENTITY,
+            rms_mm: 0.0,
+            points: 0,
+            covariance: [[0.0; 6]; 6],
+            weak_directions: Vec::new(),
+            status: Verdict::Undefined,
+            method: Method::BestFit,
+            faces: Vec::new(),
+            datums: Vec::new(),
+            free_of_datums: Vec::new(),
+        }
+    }
+}
+
+/// How a pose was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Method {
+    /// The scan was taken as it lies.
+    AsGiven,
+    /// Least squares over the faces.
+    BestFit,
+    /// On datum features.
+    Datums,
+}
+
+/// A datum feature as measured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DatumResult {
+    /// The recipe's name.
+    pub name: String,
+    /// What it holds.
+    pub kind: DatumKind,
+    /// 1 holds before 2, 2 before 3.
+    pub priority: u32,
+    /// STEP entities of its faces; empty for a reference point.
+    pub faces: Vec<u64>,
+    /// Points used.
+    pub points: usize,
+    /// How far it lies off its nominal at the pose: the place, mm.
+    pub residual_mm: f64,
+    /// And its direction, rad, where it has one.
+    pub residual_rad: Option<f64>,
+    /// Standard uncertainty of its place, mm.
+    pub u_mm: f64,
+    /// Standard deviation of its points about it, mm: noise and form.
+    pub form_mm: f64,
+}
+
+/// What a datum feature holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DatumKind {
+    /// A reference point: one direction.
+    Point,
+    /// A plane.
+    Plane,
+    /// The axis of a cylinder or cone.
+    Axis,
+    /// The centre of a sphere.
+    Centre,
 }
 
 /// One nominal edge as measured.

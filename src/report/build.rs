@@ -12,8 +12,8 @@ use super::wire::{self, Quantity, Report, Status};
 use crate::inspect::flank::FlankModel;
 use crate::inspect::recipe::{Recipe, Rule};
 use crate::inspect::result::{
-    Alignment, BreakShape, Budget, CornerResult, EdgeBreak, EdgeForm, EdgeResult, GapResult,
-    Inspection, Measured, Quantified, StationResult, Verdict,
+    Alignment, BreakShape, Budget, CornerResult, DatumKind, DatumResult, EdgeBreak, EdgeForm,
+    EdgeResult, GapResult, Inspection, Measured, Method, Quantified, StationResult, Verdict,
 };
 use crate::nominal::EdgeKind;
 
@@ -139,6 +139,7 @@ fn recipe_on_the_wire(recipe: &Recipe) -> wire::Recipe {
             d2_mm: limits(Quantity::D2),
             angle_deviation_deg: limits(Quantity::AngleDeviation),
         },
+        limits_from_pmi: recipe.limits_from_pmi,
         minimum_coverage: finite(recipe.minimum_coverage),
         u_calibration_mm: finite(recipe.u_calibration_mm),
         u_calibration_deg: degrees(recipe.u_calibration_rad),
@@ -215,6 +216,33 @@ fn alignment_from_result(alignment: &Alignment) -> wire::Alignment {
             .then_some(covariance),
         weak_directions: alignment.weak_directions.clone(),
         status,
+        method: match alignment.method {
+            Method::AsGiven => wire::AlignmentMethod::AsGiven,
+            Method::BestFit => wire::AlignmentMethod::BestFit,
+            Method::Datums => wire::AlignmentMethod::Datums,
+        },
+        faces: alignment.faces.clone(),
+        datums: alignment.datums.iter().map(datum_from_result).collect(),
+        free_of_datums: alignment.free_of_datums.clone(),
+    }
+}
+
+fn datum_from_result(found: &DatumResult) -> wire::Datum {
+    wire::Datum {
+        name: found.name.clone(),
+        kind: match found.kind {
+            DatumKind::Point => wire::DatumKind::Point,
+            DatumKind::Plane => wire::DatumKind::Plane,
+            DatumKind::Axis => wire::DatumKind::Axis,
+            DatumKind::Centre => wire::DatumKind::Centre,
+        },
+        priority: found.priority,
+        faces: found.faces.clone(),
+        points: found.points,
+        residual_mm: finite(found.residual_mm),
+        residual_deg: found.residual_rad.and_then(degrees),
+        u_mm: finite(found.u_mm),
+        form_mm: finite(found.form_mm),
     }
 }
 

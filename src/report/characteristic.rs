@@ -3,7 +3,7 @@
 use super::build::{finite, status_from_verdict};
 use super::wire::{self, Spread, Station};
 use crate::inspect::characteristic::Characteristic;
-use crate::inspect::quantity::Quantity;
+use crate::inspect::quantity::{LimitSource, Quantity};
 use crate::inspect::recipe::Rule;
 use crate::inspect::result::Budget;
 use crate::inspect::verdict::conformance;
@@ -62,6 +62,10 @@ pub fn on_the_wire(
         s_mm: found.s_mm.and_then(finite),
         lower: limit(0),
         upper: limit(1),
+        limits_from: found.limits_from.map(|source| match source {
+            LimitSource::Recipe => "recipe".to_owned(),
+            LimitSource::Pmi(entity) => format!("#{entity}"),
+        }),
         conformance: probability.filter(|_| rule != Rule::Simple),
         verdict: status_from_verdict(found.verdict),
         reason: found.reason.clone(),

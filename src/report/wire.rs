@@ -106,6 +106,8 @@ pub struct Recipe {
     pub conformance_probability: Option<f64>,
     /// Limits of every edge for which the recipe says nothing else.
     pub limits: Limits,
+    /// Whether tolerances of the nominal's PMI count as limits; each characteristic says where its own come from.
+    pub limits_from_pmi: bool,
     /// Share of an edge that must be measured for it to be decidable, 0 to 1.
     pub minimum_coverage: Option<f64>,
     /// Standard uncertainty of d1 and d2 from the calibration of the sensors, part of every u_d.
@@ -201,6 +203,63 @@ pub struct Alignment {
     pub weak_directions: Vec<String>,
     /// Ok, or not decidable.
     pub status: Status,
+    /// How the pose was found.
+    pub method: AlignmentMethod,
+    /// STEP entities of the faces of the best fit; empty = all.
+    pub faces: Vec<u64>,
+    /// The datum features that the pose rests on; empty for another method.
+    pub datums: Vec<Datum>,
+    /// What the datums leave free: there the pose is that of the best fit.
+    pub free_of_datums: Vec<String>,
+}
+
+/// How a pose was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum AlignmentMethod {
+    /// The scan was taken as lying in the part frame.
+    AsGiven,
+    /// Least squares over the faces.
+    BestFit,
+    /// On datum features.
+    Datums,
+}
+
+/// A datum feature as measured.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Datum {
+    /// The recipe's name.
+    pub name: String,
+    /// What it holds.
+    pub kind: DatumKind,
+    /// 1 holds before 2, 2 before 3.
+    pub priority: u32,
+    /// STEP entities of its faces; empty for a reference point.
+    pub faces: Vec<u64>,
+    /// Points used.
+    pub points: usize,
+    /// How far it lies off its nominal place at the pose.
+    pub residual_mm: Option<f64>,
+    /// And off its nominal direction; null where it has none.
+    pub residual_deg: Option<f64>,
+    /// Standard uncertainty of its place.
+    pub u_mm: Option<f64>,
+    /// Standard deviation of its points about it: noise and form.
+    pub form_mm: Option<f64>,
+}
+
+/// What a datum feature holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum DatumKind {
+    /// A reference point: one direction.
+    Point,
+    /// A plane.
+    Plane,
+    /// The axis of a cylinder or cone.
+    Axis,
+    /// The centre of a sphere.
+    Centre,
 }
 
 /// Convex or concave.
@@ -530,6 +589,8 @@ pub struct Characteristic {
     pub lower: Option<f64>,
     /// Upper limit; null = none on this side.
     pub upper: Option<f64>,
+    /// Where the limits come from: `recipe`, or the entity `#n` of the nominal's PMI; null without limits.
+    pub limits_from: Option<String>,
     /// Probability that the value conforms; null where the rule asks for none.
     pub conformance: Option<f64>,
     /// Worst verdict of all its values.

@@ -256,6 +256,7 @@ pub fn inspection(stations: usize) -> Inspection {
             covariance,
             weak_directions: vec![],
             status: Verdict::Ok,
+            ..Alignment::default()
         },
         unexpected_edges: vec![vec![
             DVec3::new(10.0, 20.0, 40.0),

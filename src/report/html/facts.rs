@@ -5,7 +5,9 @@ use std::fmt::{self, Write};
 use super::page::{Escaped, State};
 use super::percent;
 use crate::report::figure::{COVERAGE_FACTOR, Figure};
-use crate::report::wire::{Alignment, Losses, Quantity, Recipe, Report, Rule};
+use crate::report::wire::{
+    Alignment, AlignmentMethod, Datum, DatumKind, Losses, Quantity, Recipe, Report, Rule,
+};
 
 /// Items of a list that a page shows; more are read by nobody.
 const LISTED: usize = 40;
@@ -110,6 +112,13 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
         );
         row(out, name, &text)?;
     }
+    if recipe.limits_from_pmi {
+        row(
+            out,
+            "of the nominal",
+            "tolerances of its PMI, named beside the values",
+        )?;
+    }
     let rule = match (recipe.rule, recipe.guard_band_k) {
         (Rule::Simple, _) => "the value alone decides".to_owned(),
         (Rule::GuardBand, k) => format!(
@@ -137,12 +146,67 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
     out.write_str("</table>\n")
 }
 
+/// `datums A, B, C`, or the faces of the best fit.
+fn found_by(alignment: &Alignment) -> String {
+    match alignment.method {
+        AlignmentMethod::AsGiven => "nothing: the scan is taken as it lies".to_owned(),
+        AlignmentMethod::Datums => {
+            let names: Vec<&str> = alignment.datums.iter().map(|d| d.name.as_str()).collect();
+            let mut text = format!("datums {}", names.join(", "));
+            if !alignment.free_of_datums.is_empty() {
+                text += "; best fit in what they leave free: ";
+                text += &alignment.free_of_datums.join(", ");
+            }
+            text
+        }
+        AlignmentMethod::BestFit if alignment.faces.is_empty() => {
+            "best fit of all faces".to_owned()
+        }
+        AlignmentMethod::BestFit => {
+            let faces: Vec<String> = alignment.faces.iter().map(|f| format!("#{f}")).collect();
+            format!("best fit of the faces {}", faces.join(", "))
+        }
+    }
+}
+
+/// One row a datum feature; nothing where there are none.
+fn write_datums(out: &mut String, datums: &[Datum]) -> fmt::Result {
+    if datums.is_empty() {
+        return Ok(());
+    }
+    out.write_str(
+        "<table class=\"facts\"><thead><tr><th>datum</th><th>holds</th><th>priority</th><th>off by</th><th>U of its place</th><th>form and noise</th></tr></thead><tbody>",
+    )?;
+    for datum in datums {
+        let holds = match datum.kind {
+            DatumKind::Point => "a point",
+            DatumKind::Plane => "a plane",
+            DatumKind::Axis => "an axis",
+            DatumKind::Centre => "a centre",
+        };
+        let turned = datum
+            .residual_deg
+            .map_or_else(String::new, |angle| format!(", {angle:.4} °"));
+        writeln!(
+            out,
+            "<tr><th scope=\"row\">{}</th><td>{holds}</td><td>{}</td><td>{}{turned}</td><td>{}</td><td>{}</td></tr>",
+            Escaped(&datum.name),
+            datum.priority,
+            um(datum.residual_mm),
+            um(datum.u_mm.map(|u| COVERAGE_FACTOR * u)),
+            um(datum.form_mm),
+        )?;
+    }
+    out.write_str("</tbody></table>\n")
+}
+
 fn write_alignment(out: &mut String, alignment: &Alignment) -> fmt::Result {
     writeln!(
         out,
         "<h4>Alignment to the nominal {}</h4><table class=\"facts\">",
         State(alignment.status)
     )?;
+    row(out, "found by", &found_by(alignment))?;
     row(out, "residuals, root mean square", &um(alignment.rms_mm))?;
     row(out, "points used", &grouped(alignment.points as u64))?;
     let weak = if alignment.weak_directions.is_empty() {
@@ -171,6 +235,7 @@ fn write_alignment(out: &mut String, alignment: &Alignment) -> fmt::Result {
         )?;
     }
     out.write_str("</table>\n")?;
+    write_datums(out, &alignment.datums)?;
     let Some(matrix) = alignment.part_from_machine else {
         return out.write_str("<p>No pose was found.</p>\n");
     };

@@ -82,14 +82,18 @@ fn expanded(quantity: Quantity, u: f64) -> String {
 
 fn limits(found: &Characteristic) -> String {
     let figure = |limit| Figure::of(found.quantity, limit, None);
-    match (found.lower, found.upper) {
+    let mut text = match (found.lower, found.upper) {
         (Some(lower), Some(upper)) => {
             format!("{} to {}", figure(lower).value, figure(upper).with_unit())
         }
         (None, Some(upper)) => format!("at most {}", figure(upper).with_unit()),
         (Some(lower), None) => format!("at least {}", figure(lower).with_unit()),
-        (None, None) => String::new(),
+        (None, None) => return String::new(),
+    };
+    if let Some(entity) = found.limits_from.as_deref().filter(|f| f.starts_with('#')) {
+        text += &format!(" (PMI {entity})");
     }
+    text
 }
 
 /// One line a kind of shape: over how much of the edge, and between which sizes.
