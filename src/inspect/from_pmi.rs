@@ -3,7 +3,7 @@
 //! | in the file | on | becomes |
 //! |---|---|---|
 //! | surface or line profile, zone t, evenly about the nominal | a face of the edge | d along that face's normal within +-t/2 |
-//! | position, zone t | a plane that is a face of the edge | the same |
+//! | position, zone t | one plane alone, a face of the edge | the same |
 //! | line profile, zone t, with datums | the edge | line profile at most t |
 //! | line profile, zone t, without datums | the edge | line profile without datums at most t |
 //! | straightness, zone t | the edge | straightness at most t |
@@ -128,9 +128,14 @@ fn take(
         } => {
             let profile = matches!(what.as_str(), "surface_profile" | "line_profile");
             let straightness = what == "straightness";
-            let place = profile || (what == "position" && pmi.faces.iter().all(|f| is_plane(*f)));
+            // On several planes it is of a slot or a tab, whose middle plane has its place.
+            let one_plane = matches!(pmi.faces[..], [face] if is_plane(face));
+            let place = profile || (what == "position" && one_plane);
             if !place && !straightness {
-                return Err(format!("{} is of a face", what.replace('_', " ")));
+                return Err(format!(
+                    "{} is of a face or of a feature of size",
+                    what.replace('_', " ")
+                ));
             }
             if *unequal {
                 return Err("its zone lies unevenly about the nominal".to_owned());
@@ -270,7 +275,7 @@ mod tests {
         let hole = tolerance("position", &["A"], false);
         assert!(taken(&hole, Some(&["A"])).is_err());
         let flat = tolerance("flatness", &[], false);
-        assert!(taken(&flat, None).is_err_and(|why| why == "flatness is of a face"));
+        assert!(taken(&flat, None).is_err_and(|why| why.starts_with("flatness is of a face")));
     }
 
     #[test]

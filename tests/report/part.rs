@@ -9,7 +9,8 @@ use acies::inspect::flank::FlankModel;
 use acies::inspect::quantity::Quantity;
 use acies::inspect::recipe::{Limits, Recipe, Rule};
 use acies::inspect::result::{
-    Alignment, Budget, EdgeResult, Inspection, Measured, Quantified, StationResult, Verdict,
+    Alignment, Budget, DatumKind, DatumResult, EdgeResult, Inspection, Measured, Method,
+    Quantified, StationResult, Verdict,
 };
 use acies::nominal::{EdgeKind, Station};
 use acies::report::{DeviceFacts, Facts, ScanFacts};
@@ -256,6 +257,19 @@ pub fn inspection(stations: usize) -> Inspection {
             covariance,
             weak_directions: vec![],
             status: Verdict::Ok,
+            method: Method::Datums,
+            datums: vec![DatumResult {
+                name: "A <top>".to_owned(),
+                kind: DatumKind::Plane,
+                priority: 1,
+                faces: vec![17],
+                points: 4_100,
+                residual_mm: 0.0,
+                residual_rad: Some(1e-5),
+                u_mm: 0.0004,
+                form_mm: 0.012,
+            }],
+            free_of_datums: vec!["rotation about z".to_owned()],
             ..Alignment::default()
         },
         unexpected_edges: vec![vec![
