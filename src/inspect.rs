@@ -32,6 +32,7 @@ use glam::DVec3;
 
 pub use align::{AlignOptions, Start, Touch};
 pub use body::Body;
+pub use monte_carlo::MonteCarlo;
 pub use recipe::Recipe;
 pub use result::Inspection;
 
@@ -41,6 +42,7 @@ use body::BodyEdge;
 use characteristic::{EdgeValues, at_station, characteristics};
 use corner::CornerSettings;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges_stepped};
+use monte_carlo::measure_edges_drawn;
 use quantity::{Limits, Quantity};
 use recipe::{EdgeFacts, EdgeKey, Resolved};
 use result::{EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
@@ -62,8 +64,22 @@ pub struct Request<'a> {
     pub temperature_c: Option<f64>,
     /// Contacts of a probe with the part, in the frame of the scan.
     pub touches: &'a [Touch],
+    /// How uncertainties are propagated.
+    pub uncertainty: Uncertainty,
     /// Told the name of every stage as it begins.
     pub progress: &'a (dyn Fn(&'static str) + Sync),
+    /// Told how many edges of how many have had their trials.
+    pub trials_done: &'a (dyn Fn(usize, usize) + Sync),
+}
+
+/// How uncertainties are propagated.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Uncertainty {
+    /// By first derivatives (JCGM 100).
+    #[default]
+    FirstOrder,
+    /// By trials (JCGM 101): of d1, d2, the total, the included angle and edge breaks; the rest by first derivatives.
+    MonteCarlo(MonteCarlo),
 }
 
 impl<'a> Request<'a> {
@@ -74,7 +90,9 @@ impl<'a> Request<'a> {
             start,
             temperature_c: None,
             touches: &[],
+            uncertainty: Uncertainty::FirstOrder,
             progress: &|_| {},
+            trials_done: &|_, _| {},
         }
     }
 }
@@ -141,7 +159,18 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let (resolved, of_recipe) = resolve(nominal, &facts, request.recipe);
     findings.extend(of_recipe);
     let steps: Vec<Option<f64>> = resolved.iter().map(|r| r.station_step_mm).collect();
-    let measured = measure_edges_stepped(&part, &places, &surface, &settings, &steps);
+    let (measured, trials) = match &request.uncertainty {
+        Uncertainty::FirstOrder => {
+            let edges = measure_edges_stepped(&part, &places, &surface, &settings, &steps);
+            (edges, None)
+        }
+        Uncertainty::MonteCarlo(how) => {
+            let given = (&settings, &steps[..]);
+            let told = request.trials_done;
+            let (edges, trials) = measure_edges_drawn(&part, &places, &surface, given, how, told);
+            (edges, Some(trials))
+        }
+    };
     stages.begin("comparison of edges found");
     let known = (scan.spacing, scan.noise_mm);
     let detection = features::detect_knowing(cloud, &neighbors, known, Method::Adaptive);
@@ -190,6 +219,7 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         unexpected_edges: compared.unexpected,
         missing_edges: compared.missing,
         verdict,
+        trials,
         seconds: stages.end(),
         findings,
         scan: Some(ScanEstimate {

@@ -6,11 +6,13 @@
 //!
 //! Source: features-and-standards, section 5, characteristics 6 to 12.
 
+mod draw;
 mod fit;
 mod profile;
 
 use super::flank::FlankFit;
 use super::result::{BreakShape, EdgeBreak, Quantified};
+pub(super) use draw::draw_stretch;
 use fit::{Fitted, Shape, choose};
 use profile::Profile;
 
@@ -168,57 +170,91 @@ impl Zone<'_> {
     }
 }
 
+/// A stretch with the shape that was chosen for it.
+struct Analysis<'a> {
+    zone: Zone<'a>,
+    fitted: Fitted,
+    profile: Profile,
+    /// Whether the profile refuses the shape.
+    irregular: bool,
+}
+
+impl<'a> Analysis<'a> {
+    /// `None` where too few points lie near the edge, or the flanks are one plane.
+    fn new(stretch: &'a Stretch<'a>) -> Option<Self> {
+        let zone = stretch.zone()?;
+        let fitted = choose(&zone);
+        let profile = Profile::new(&zone);
+        let irregular = profile.departs_from(&zone, &fitted.shape());
+        Some(Self {
+            zone,
+            fitted,
+            profile,
+            irregular,
+        })
+    }
+
+    fn found(&self) -> Option<Found> {
+        let stretch = self.zone.stretch;
+        let first = stretch.wedges.first()?;
+        let last = stretch.wedges.last()?;
+        let mut form = if self.irregular {
+            self.profile.form()
+        } else {
+            of_model(&self.zone, &self.fitted)
+        };
+        if !self.irregular {
+            // An excess beside a shape that fits otherwise.
+            form.excess = self.profile.excess();
+        }
+        let passing = larger(form.excess);
+        let largest = if form.missing[0].value >= form.missing[1].value {
+            form.missing[0]
+        } else {
+            form.missing[1]
+        };
+        let shape = EdgeBreak {
+            s_mm: [
+                first.s - 0.5 * stretch.step_mm,
+                last.s + 0.5 * stretch.step_mm,
+            ],
+            shape: if self.irregular {
+                BreakShape::Irregular
+            } else {
+                self.fitted.outer(&self.zone)
+            },
+            detachment_mm: form.detachment,
+            truncation_mm: form.truncation,
+            // A concave edge has its excess where a convex one misses material.
+            burr_mm: if stretch.convex { passing } else { largest },
+            undercut_mm: if stretch.convex {
+                form.missing
+            } else {
+                form.excess
+            },
+            points: self.zone.points.len(),
+        };
+        Some(Found {
+            shape,
+            highest: form.highest.map(|x| self.zone.sign * x),
+        })
+    }
+}
+
+/// The larger of two excesses; where there is none, none with the uncertainty of the first.
+fn larger(excess: [Quantified; 2]) -> Quantified {
+    let nothing = Quantified {
+        value: 0.0,
+        u: excess[0].u,
+    };
+    excess
+        .into_iter()
+        .fold(nothing, |a, b| if b.value > a.value { b } else { a })
+}
+
 /// The shape of one stretch; `None` where too few points lie near the edge, or the flanks are one plane.
 pub(super) fn measure_stretch(stretch: &Stretch<'_>) -> Option<Found> {
-    let zone = stretch.zone()?;
-    let fitted = choose(&zone);
-    let profile = Profile::new(&zone);
-    let irregular = profile.departs_from(&zone, &fitted.shape());
-    let first = stretch.wedges.first()?;
-    let last = stretch.wedges.last()?;
-    let mut form = if irregular {
-        profile.form()
-    } else {
-        of_model(&zone, &fitted)
-    };
-    if !irregular {
-        // An excess beside a shape that fits otherwise.
-        form.excess = profile.excess();
-    }
-    let passing = form.excess.iter().copied().fold(
-        Quantified {
-            value: 0.0,
-            u: form.excess[0].u,
-        },
-        |a, b| if b.value > a.value { b } else { a },
-    );
-    let missing = form.missing;
-    let largest = if missing[0].value >= missing[1].value {
-        missing[0]
-    } else {
-        missing[1]
-    };
-    let shape = EdgeBreak {
-        s_mm: [
-            first.s - 0.5 * stretch.step_mm,
-            last.s + 0.5 * stretch.step_mm,
-        ],
-        shape: if irregular {
-            BreakShape::Irregular
-        } else {
-            fitted.outer(&zone)
-        },
-        detachment_mm: form.detachment,
-        truncation_mm: form.truncation,
-        // A concave edge has its excess where a convex one misses material.
-        burr_mm: if stretch.convex { passing } else { largest },
-        undercut_mm: if stretch.convex { missing } else { form.excess },
-        points: zone.points.len(),
-    };
-    Some(Found {
-        shape,
-        highest: form.highest.map(|x| zone.sign * x),
-    })
+    Analysis::new(stretch)?.found()
 }
 
 /// The sizes that every shape has, for a convex edge.
@@ -290,6 +326,12 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
     }
 }
 
+/// Angle of a chamfer's plane to the first flank, rad, from its legs and the included angle.
+fn chamfer_angle([a, b]: [f64; 2], included_rad: f64) -> f64 {
+    let (sin, cos) = included_rad.sin_cos();
+    (b * sin).atan2(a - b * cos)
+}
+
 impl Fitted {
     fn outer(&self, zone: &Zone<'_>) -> BreakShape {
         match self {
@@ -299,12 +341,12 @@ impl Fitted {
             Self::Round { radius } => BreakShape::Round { radius_mm: *radius },
             Self::Chamfer { legs, covariance } => {
                 let included = std::f64::consts::PI - zone.turn;
-                let angle = |a: f64, b: f64, phi: f64| (b * phi.sin()).atan2(a - b * phi.cos());
+                let angle = |a: f64, b: f64| chamfer_angle([a, b], included);
                 let [a, b] = *legs;
                 let step = 1e-4 * a.min(b);
                 let by = [
-                    (angle(a + step, b, included) - angle(a - step, b, included)) / (2.0 * step),
-                    (angle(a, b + step, included) - angle(a, b - step, included)) / (2.0 * step),
+                    (angle(a + step, b) - angle(a - step, b)) / (2.0 * step),
+                    (angle(a, b + step) - angle(a, b - step)) / (2.0 * step),
                 ];
                 let variance = (0..2)
                     .map(|i| {
@@ -316,7 +358,7 @@ impl Fitted {
                 BreakShape::Chamfer {
                     legs_mm: self.legs(zone.turn),
                     angle_rad: Quantified {
-                        value: angle(a, b, included),
+                        value: angle(a, b),
                         u: variance.max(0.0).sqrt(),
                     },
                 }

@@ -1,5 +1,7 @@
 //! Every sharp edge of the nominal, measured station by station on an aligned scan.
 
+use std::ops::Range;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -203,7 +205,7 @@ fn centre(scene: &Scene<'_>) -> DVec3 {
 
 impl<B: Body> Flanks<'_, B> {
     /// The points of every edge's transition zone.
-    fn zones(&self) -> Vec<Vec<ZonePoint>> {
+    pub(super) fn zones(&self) -> Vec<Vec<ZonePoint>> {
         let radius = |pair: &[FlankSeries; 2]| {
             let fits = || pair.iter().flat_map(|s| s.stations.iter().flatten());
             let cut = fits().map(|f| f.cut_mm).fold(0.0, f64::max);
@@ -374,7 +376,7 @@ pub(super) struct EdgeContext<'a, B: Body> {
 }
 
 impl<B: Body> EdgeContext<'_, B> {
-    fn combine(
+    pub(super) fn combine(
         &self,
         windows: &Windows,
         series: &[FlankSeries; 2],
@@ -425,6 +427,21 @@ impl<B: Body> EdgeContext<'_, B> {
 
     pub(super) fn station(&self, windows: &Windows, k: usize) -> Station {
         self.body.station(self.index, windows.centre(k))
+    }
+
+    /// Where the flanks of every station meet.
+    pub(super) fn virtual_edges(
+        &self,
+        windows: &Windows,
+        series: &[FlankSeries; 2],
+    ) -> Vec<Option<VirtualEdge>> {
+        let of = |k: usize| match (&series[0].stations[k], &series[1].stations[k]) {
+            (Ok(first), Ok(second)) => {
+                self.virtual_edge(&self.station(windows, k), [first, second])
+            }
+            _ => None,
+        };
+        (0..windows.count).map(of).collect()
     }
 
     pub(super) fn virtual_edge(
@@ -545,17 +562,36 @@ impl<B: Body> EdgeContext<'_, B> {
         stations: &mut [MeasuredStation],
     ) -> Vec<EdgeBreak> {
         let mut breaks = Vec::new();
+        for (range, stretch) in self.stretches(windows, series, zone, edges) {
+            if let Some(found) = edge_break::measure_stretch(&stretch) {
+                for station in &mut stations[range] {
+                    add_ridge(station, &found);
+                }
+                breaks.push(found.shape);
+            }
+        }
+        breaks
+    }
+
+    /// The stretches of an edge in which some station was measured, each with its stations.
+    pub(super) fn stretches<'s>(
+        &self,
+        windows: &Windows,
+        series: &'s [FlankSeries; 2],
+        zone: &'s [ZonePoint],
+        edges: &[Option<VirtualEdge>],
+    ) -> Vec<(Range<usize>, Stretch<'s>)> {
+        let wedge = |k: usize| match (&series[0].stations[k], &series[1].stations[k], edges[k]) {
+            (Ok(a), Ok(b), Some(edge)) => Some(Wedge {
+                s: windows.centre(k),
+                flanks: [a, b],
+                included_angle_rad: edge.included_angle_rad,
+            }),
+            _ => None,
+        };
+        let mut stretches = Vec::new();
         for first in (0..windows.count).step_by(STRETCH) {
             let range = first..(first + STRETCH).min(windows.count);
-            let wedge = |k: usize| match (&series[0].stations[k], &series[1].stations[k], edges[k])
-            {
-                (Ok(a), Ok(b), Some(edge)) => Some(Wedge {
-                    s: windows.centre(k),
-                    flanks: [a, b],
-                    included_angle_rad: edge.included_angle_rad,
-                }),
-                _ => None,
-            };
             let from = first as f64 * windows.step_mm;
             let to = range.end as f64 * windows.step_mm;
             let points = zone.partition_point(|p| p.s < from)..zone.partition_point(|p| p.s < to);
@@ -567,17 +603,11 @@ impl<B: Body> EdgeContext<'_, B> {
                 convex: self.edge.kind == EdgeKind::Convex,
                 shared_factor: [series[0].shared_factor, series[1].shared_factor],
             };
-            if stretch.wedges.is_empty() {
-                continue;
-            }
-            if let Some(found) = edge_break::measure_stretch(&stretch) {
-                for station in &mut stations[range] {
-                    add_ridge(station, &found);
-                }
-                breaks.push(found.shape);
+            if !stretch.wedges.is_empty() {
+                stretches.push((range, stretch));
             }
         }
-        breaks
+        stretches
     }
 
     fn mean(&self, sum: &MeanSum, series: &[FlankSeries; 2]) -> Option<EdgeMean> {
@@ -671,14 +701,21 @@ fn gap_text(gap: &FlankGap) -> String {
     }
 }
 
+/// Distance across the tangent from its two components along the normals, mm.
+pub(super) fn across(station: &Station, d: [f64; 2]) -> f64 {
+    let c = station.normals[0].dot(station.normals[1]);
+    let sine = (1.0 - c * c).max(1e-12);
+    ((d[0] * d[0] + d[1] * d[1] - 2.0 * c * d[0] * d[1]) / sine)
+        .max(0.0)
+        .sqrt()
+}
+
 /// Distance across the tangent from its two components along the normals, with first-order uncertainty; near zero, where the
 /// distance has no derivative, that of the worse component.
 fn total(station: &Station, d: [f64; 2], u: [f64; 2], covariance: f64) -> Quantified {
     let c = station.normals[0].dot(station.normals[1]);
     let sine = (1.0 - c * c).max(1e-12);
-    let value = ((d[0] * d[0] + d[1] * d[1] - 2.0 * c * d[0] * d[1]) / sine)
-        .max(0.0)
-        .sqrt();
+    let value = across(station, d);
     let worst = u[0].max(u[1]) / sine.sqrt();
     let by = [d[0] - c * d[1], d[1] - c * d[0]].map(|x| x / (sine * value.max(1e-12)));
     let variance = by[0].powi(2) * u[0].powi(2)

@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 use super::flank::FlankModel;
+use super::monte_carlo::Trials;
 use crate::features::Class;
 use crate::geometry::RigidTransform;
 use crate::nominal::{EdgeKind, Station};
@@ -40,6 +41,8 @@ pub struct Inspection {
     pub missing_edges: Vec<String>,
     /// Worst of the edges and of the alignment.
     pub verdict: Verdict,
+    /// The trials of the Monte Carlo method; `None` where uncertainties are of first order.
+    pub trials: Option<Trials>,
     /// Seconds by stage, in order.
     pub seconds: Vec<(&'static str, f64)>,
     /// What was wrong with the data; the result goes on.

@@ -10,6 +10,7 @@ use super::characteristic::{on_the_wire, spread};
 use super::conclusion;
 use super::wire::{self, Quantity, Report, Status};
 use crate::inspect::flank::FlankModel;
+use crate::inspect::monte_carlo::Trials;
 use crate::inspect::recipe::{Recipe, Rule};
 use crate::inspect::result::{
     Alignment, BreakShape, Budget, CornerResult, DatumKind, DatumResult, EdgeBreak, EdgeForm,
@@ -58,6 +59,7 @@ impl Report {
             scan: scan_from_facts(facts),
             devices: devices_from_facts(facts),
             alignment,
+            uncertainty: uncertainty_from_trials(inspection.trials),
             edges,
             corners: inspection
                 .corners
@@ -224,6 +226,19 @@ fn alignment_from_result(alignment: &Alignment) -> wire::Alignment {
         faces: alignment.faces.clone(),
         datums: alignment.datums.iter().map(datum_from_result).collect(),
         free_of_datums: alignment.free_of_datums.clone(),
+    }
+}
+
+fn uncertainty_from_trials(trials: Option<Trials>) -> wire::Uncertainty {
+    wire::Uncertainty {
+        method: match trials {
+            Some(_) => wire::UncertaintyMethod::MonteCarlo,
+            None => wire::UncertaintyMethod::FirstOrder,
+        },
+        trials: trials.map(|t| t.stations),
+        break_trials: trials.map(|t| t.breaks),
+        seed: trials.map(|t| t.seed),
+        unstable_stations: trials.map(|t| t.unstable),
     }
 }
 

@@ -44,6 +44,8 @@ pub struct Report {
     pub devices: Vec<Device>,
     /// How the scan lies in the part frame.
     pub alignment: Alignment,
+    /// How the uncertainties were propagated.
+    pub uncertainty: Uncertainty,
     /// One for every sharp edge of the nominal.
     pub edges: Vec<Edge>,
     /// Where three faces or more meet.
@@ -58,6 +60,31 @@ pub struct Report {
     pub findings: Vec<String>,
     /// Seconds by stage, in order of the work.
     pub seconds: IndexMap<String, f64>,
+}
+
+/// How uncertainties were propagated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Uncertainty {
+    /// Of d1, d2, the total, the included angle and the edge breaks; all others are of first order.
+    pub method: UncertaintyMethod,
+    /// Fewest and most trials of a station; null for first order.
+    pub trials: Option<[usize; 2]>,
+    /// Most trials of an edge break.
+    pub break_trials: Option<usize>,
+    /// Seed of the trials.
+    pub seed: Option<u64>,
+    /// Stations whose values did not stand still to two digits of u when the trials ended.
+    pub unstable_stations: Option<usize>,
+}
+
+/// How uncertainties were propagated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum UncertaintyMethod {
+    /// By first derivatives (JCGM 100).
+    FirstOrder,
+    /// By trials (JCGM 101).
+    MonteCarlo,
 }
 
 /// Name and version of the contract.

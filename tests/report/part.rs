@@ -245,6 +245,7 @@ pub fn inspection(stations: usize) -> Inspection {
         row[i] = if i < 3 { 4e-10 } else { 4e-6 };
     }
     let mut inspection = Inspection {
+        trials: None,
         corners: Vec::new(),
         gaps: Vec::new(),
         alignment: Alignment {

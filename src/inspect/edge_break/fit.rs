@@ -154,13 +154,22 @@ impl Zone<'_> {
     /// Gauss-Newton on the distances within [`TRIM`] standard deviations; the parameters and their covariance, the flanks' share
     /// included. `None` where the data do not hold them.
     fn fit<const P: usize>(&self, start: [f64; P]) -> Option<([f64; P], [[f64; P]; P])> {
+        let p = self.descend(start)?;
+        let e = self.residuals(&shape_of(&p));
+        let covariance = self.covariance(&p, &e)?;
+        Some((p, covariance))
+    }
+
+    fn residuals(&self, shape: &Shape) -> Vec<f64> {
+        let of = |q: &WedgePoint| shape.distance(q.d, self.turns[q.wedge]);
+        self.points.iter().map(of).collect()
+    }
+
+    /// The parameters alone.
+    pub(super) fn descend<const P: usize>(&self, start: [f64; P]) -> Option<[f64; P]> {
         let mut p = start;
-        let residuals = |shape: &Shape| -> Vec<f64> {
-            let of = |q: &WedgePoint| shape.distance(q.d, self.turns[q.wedge]);
-            self.points.iter().map(of).collect()
-        };
         for _ in 0..40 {
-            let e = residuals(&shape_of(&p));
+            let e = self.residuals(&shape_of(&p));
             let limit = TRIM * mad_sigma(&e).max(self.sigma);
             let mut sums = NormalSums::<P>::default();
             for (q, e) in self.points.iter().zip(&e) {
@@ -184,9 +193,7 @@ impl Zone<'_> {
         }) {
             return None;
         }
-        let e = residuals(&shape_of(&p));
-        let covariance = self.covariance(&p, &e)?;
-        Some((p, covariance))
+        Some(p)
     }
 
     fn gradient<const P: usize>(&self, p: &[f64; P], q: &WedgePoint) -> [f64; P] {

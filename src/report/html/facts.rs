@@ -7,6 +7,7 @@ use super::percent;
 use crate::report::figure::{COVERAGE_FACTOR, Figure};
 use crate::report::wire::{
     Alignment, AlignmentMethod, Datum, DatumKind, Losses, Quantity, Recipe, Report, Rule,
+    Uncertainty, UncertaintyMethod,
 };
 
 /// Items of a list that a page shows; more are read by nobody.
@@ -27,6 +28,7 @@ pub fn write(out: &mut String, report: &Report) -> fmt::Result {
         "<section class=\"card\"><h2>How it was measured</h2>\n<div class=\"columns\"><div>\n",
     )?;
     write_recipe(out, &report.recipe)?;
+    write_uncertainty(out, &report.uncertainty)?;
     write_alignment(out, &report.alignment)?;
     out.write_str("</div><div>\n")?;
     write_scan(out, report)?;
@@ -142,6 +144,37 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
     )?;
     if !recipe.sha256.is_empty() {
         row(out, "SHA-256 of the recipe", &recipe.sha256)?;
+    }
+    out.write_str("</table>\n")
+}
+
+fn write_uncertainty(out: &mut String, used: &Uncertainty) -> fmt::Result {
+    out.write_str("<h4>Uncertainty</h4><table class=\"facts\">")?;
+    match (used.method, used.trials) {
+        (UncertaintyMethod::MonteCarlo, Some([least, most])) => {
+            row(out, "propagated by", "trials (Monte Carlo, JCGM 101)")?;
+            let (least, most) = (grouped(least as u64), grouped(most as u64));
+            let each = if least == most {
+                most
+            } else {
+                format!("{least} to {most}")
+            };
+            row(out, "trials of a station", &each)?;
+            if let Some(trials) = used.break_trials {
+                row(out, "trials of an edge break", &grouped(trials as u64))?;
+            }
+            if let Some(seed) = used.seed {
+                row(out, "seed", &seed.to_string())?;
+            }
+            if let Some(unstable) = used.unstable_stations.filter(|n| *n > 0) {
+                row(
+                    out,
+                    "stations that did not stand still",
+                    &unstable.to_string(),
+                )?;
+            }
+        }
+        _ => row(out, "propagated by", "first derivatives (JCGM 100)")?,
     }
     out.write_str("</table>\n")
 }
