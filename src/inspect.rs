@@ -43,7 +43,7 @@ use characteristic::{EdgeValues, at_station, characteristics};
 use corner::CornerSettings;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges_stepped};
 use monte_carlo::measure_edges_drawn;
-use quantity::{Limits, Quantity};
+use quantity::{Extent, Limits, Quantity};
 use recipe::{EdgeFacts, EdgeKey, Resolved};
 use result::{EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
 use verdict::judge;
@@ -405,6 +405,7 @@ fn judged(
             let mut station = StationResult {
                 station: s.station,
                 measured,
+                boundary: s.boundary,
                 points: s.points,
                 verdict: Verdict::Undefined,
                 reason,
@@ -413,7 +414,23 @@ fn judged(
             station
         })
         .collect();
-    let coverage = stations.iter().filter(|s| s.measured.is_some()).count() as f64 / total as f64;
+    let share = |of: &dyn Fn(&StationResult) -> bool| {
+        stations.iter().filter(|s| of(s)).count() as f64 / total as f64
+    };
+    let coverage = share(&|s| s.measured.is_some());
+    let boundary_share = share(&|s| s.boundary.is_some());
+    // Where limits ask for nothing but what a boundary shows, its stations answer for the edge.
+    let asked_here: Vec<Quantity> = Quantity::all()
+        .filter(|q| q.extent() == Extent::Station && asked.limits.of(*q).is_some())
+        .collect();
+    let answered = share(&|s| {
+        s.measured.is_some()
+            || (s.boundary.is_some()
+                && !asked_here.is_empty()
+                && asked_here
+                    .iter()
+                    .all(|q| at_station(s, edge.kind, *q).is_some()))
+    });
     let form = form::form(&stations, recipe.direction_mm);
     let values = EdgeValues {
         kind: edge.kind,
@@ -424,7 +441,7 @@ fn judged(
     let characteristics = characteristics(&values, &asked.limits, recipe.rule);
     let verdict = verdict::judge_edge(
         characteristics.iter().map(|c| c.verdict),
-        coverage,
+        answered,
         recipe.minimum_coverage,
         !asked.limits.is_empty(),
     );
@@ -434,6 +451,7 @@ fn judged(
         kind: edge.kind,
         length_mm: edge.length_mm,
         coverage,
+        boundary_share,
         stations,
         breaks: measured.breaks,
         form,
@@ -460,6 +478,9 @@ fn judge_station(station: &mut StationResult, edge: &BodyEdge, asked: &Resolved,
         station.verdict = station.verdict.max(verdict);
     }
     if station.verdict == Verdict::NotDecidable {
+        if !station.reason.is_empty() {
+            reasons.insert(0, std::mem::take(&mut station.reason));
+        }
         station.reason = reasons.join("; ");
     }
 }

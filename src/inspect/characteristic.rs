@@ -95,12 +95,16 @@ fn always(quantity: Quantity) -> bool {
     )
 }
 
-/// `quantity` at one station; `None` where it was not measured, or belongs to no station.
+/// `quantity` at one station; `None` where it was not measured, or belongs to no station. A boundary has the d of the flank that was seen.
 pub fn at_station(
     station: &StationResult,
     kind: EdgeKind,
     quantity: Quantity,
 ) -> Option<Quantified> {
+    if let Some(boundary) = &station.boundary {
+        let own = [Quantity::D1, Quantity::D2][boundary.flank];
+        return (quantity == own).then_some(boundary.d_mm);
+    }
     let measured = station.measured.as_ref()?;
     let d = |i: usize| Quantified {
         value: measured.d_mm[i],

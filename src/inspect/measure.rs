@@ -13,7 +13,9 @@ use super::edge_break::{self, Found, POINTS_MAX, STRETCH, Stretch, Wedge, ZonePo
 use super::flank::{
     FlankFit, FlankGap, FlankModel, FlankSeries, FlankSettings, Windows, measure_flank,
 };
-use super::result::{Budget, DepthPoint, EdgeBreak, EdgeMean, EdgePoint, Measured, Quantified};
+use super::result::{
+    Boundary, Budget, DepthPoint, EdgeBreak, EdgeMean, EdgePoint, Measured, Quantified,
+};
 use super::virtual_edge::{VirtualEdge, intersect, nominal_angle};
 use crate::nominal::{EdgeKind, Station};
 use crate::points::PointCloud;
@@ -80,6 +82,8 @@ pub struct MeasuredStation {
     pub station: Station,
     /// What was measured, or why not.
     pub outcome: Result<Measured, String>,
+    /// The one flank that was seen, where only one was.
+    pub boundary: Option<Boundary>,
     /// Points used on each flank.
     pub points: [usize; 2],
 }
@@ -410,9 +414,15 @@ impl<B: Body> EdgeContext<'_, B> {
                 _ => Err(self.reason(flanks)),
             };
             edges.push(edge);
+            let boundary = match flanks {
+                [Ok(seen), Err(_)] => Some(self.boundary(&station, seen, 0)),
+                [Err(_), Ok(seen)] => Some(self.boundary(&station, seen, 1)),
+                _ => None,
+            };
             stations.push(MeasuredStation {
                 station,
                 outcome,
+                boundary,
                 points,
             });
         }
@@ -514,6 +524,29 @@ impl<B: Body> EdgeContext<'_, B> {
             flank_model: models,
             ridge: None,
             at_depth: [0, 1].map(|i| self.at_depth(station, edge, flanks[i], i, reach_mm[i])),
+        }
+    }
+
+    /// The deviation of the one flank that was seen, at the nominal edge.
+    fn boundary(&self, station: &Station, seen: &FlankFit, flank: usize) -> Boundary {
+        let n = station.normals[flank];
+        let point = station.point + seen.offset_mm * n;
+        let correction = self.shared.correction(point);
+        let [alignment, temperature] = self.shared.u(&self.shared.response(point, n));
+        let budget = Budget {
+            points: seen.covariance[0][0].sqrt(),
+            alignment,
+            calibration: self.shared.u_calibration_mm,
+            temperature,
+        };
+        Boundary {
+            flank,
+            point: point + correction,
+            d_mm: Quantified {
+                value: seen.offset_mm + correction.dot(n),
+                u: budget.u(),
+            },
+            budget,
         }
     }
 

@@ -165,6 +165,8 @@ pub struct EdgeResult {
     pub length_mm: f64,
     /// Share of the length that was measured, 0 to 1.
     pub coverage: f64,
+    /// Share of the length of which only one flank was seen, 0 to 1.
+    pub boundary_share: f64,
     /// In order of arc length.
     pub stations: Vec<StationResult>,
     /// The shape of the edge itself, one a stretch of stations, in order of arc length; empty where it was not seen.
@@ -267,12 +269,27 @@ pub struct StationResult {
     pub station: Station,
     /// What was measured there.
     pub measured: Option<Measured>,
+    /// The one flank that was seen, where only one was.
+    pub boundary: Option<Boundary>,
     /// Points used on each flank.
     pub points: [usize; 2],
     /// Verdict of the station.
     pub verdict: Verdict,
     /// Why it was not measured or not decidable; empty otherwise.
     pub reason: String,
+}
+
+/// A station of which only one flank was seen: the edge is a boundary of the scan, and only its offset along that flank's normal is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Boundary {
+    /// The flank that was seen: 0 or 1.
+    pub flank: usize,
+    /// The measured face at the nominal edge, mm, part frame.
+    pub point: DVec3,
+    /// Its deviation along the normal of the face, mm; plus = material outside the nominal.
+    pub d_mm: Quantified,
+    /// What its uncertainty is made of.
+    pub budget: Budget,
 }
 
 /// The virtual edge at a station and its deviations. Sign: plus = material outside the nominal.

@@ -296,6 +296,7 @@ fn edge_from_result(edge: &EdgeResult, facts: &Facts, findings: &mut Vec<String>
         },
         length_mm: finite(edge.length_mm),
         coverage: finite(edge.coverage).unwrap_or(summary.measured_share),
+        boundary_share: finite(edge.boundary_share),
         stations,
         breaks: edge.breaks.iter().filter_map(break_from_result).collect(),
         form: edge.form.as_ref().map(form_from_result),
@@ -325,6 +326,9 @@ fn summary(edge: &EdgeResult, stations: &[wire::Station]) -> wire::Summary {
 fn worst_budget(edge: &EdgeResult, quantity: Quantity, s_mm: Option<f64>) -> Option<Budget> {
     let mut stations = edge.stations.iter();
     let station = stations.find(|station| Some(station.station.s_mm) == s_mm)?;
+    if let Some(boundary) = &station.boundary {
+        return Some(boundary.budget);
+    }
     let measured = station.measured.as_ref()?;
     match quantity {
         Quantity::D1 => Some(measured.budget_d[0]),
@@ -463,6 +467,14 @@ fn station_from_result(
         included_angle_deg: None,
         u_included_angle_deg: None,
         total_mm: None,
+        boundary: result.boundary.as_ref().and_then(|found| {
+            Some(wire::Boundary {
+                flank: found.flank + 1,
+                point: xyz(found.point)?,
+                d_mm: value(found.d_mm),
+                budget: with_budget.then(|| budget_on_the_wire(found.budget, 1.0)),
+            })
+        }),
         flank_models: None,
         ridge: None,
         at_depth: [None; 2],
@@ -484,12 +496,16 @@ fn station_from_result(
 fn budgets(measured: &Measured) -> [wire::Budget; 3] {
     let [d1, d2] = measured.budget_d;
     let each = [(d1, 1.0), (d2, 1.0), (measured.budget_angle, 180.0 / PI)];
-    each.map(|(budget, scale)| wire::Budget {
+    each.map(|(budget, scale)| budget_on_the_wire(budget, scale))
+}
+
+fn budget_on_the_wire(budget: Budget, scale: f64) -> wire::Budget {
+    wire::Budget {
         points: finite(scale * budget.points),
         alignment: finite(scale * budget.alignment),
         calibration: finite(scale * budget.calibration),
         temperature: finite(scale * budget.temperature),
-    })
+    }
 }
 
 /// Takes over what is finite; says what was not.

@@ -19,7 +19,13 @@ pub struct Sample {
 
 /// `quantity` at one station; `None` where it was not measured, or belongs to no station.
 pub fn sample(station: &Station, quantity: Quantity) -> Option<Sample> {
+    let of_boundary = |flank: usize| {
+        let seen = station.boundary.filter(|seen| seen.flank == flank);
+        seen.map_or((None, None), |seen| (seen.d_mm.value, seen.d_mm.u))
+    };
     let (value, u) = match quantity {
+        Quantity::D1 if station.boundary.is_some() => of_boundary(1),
+        Quantity::D2 if station.boundary.is_some() => of_boundary(2),
         Quantity::D1 => (station.d1_mm, station.u_d1_mm),
         Quantity::D2 => (station.d2_mm, station.u_d2_mm),
         Quantity::AngleDeviation => (

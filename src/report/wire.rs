@@ -312,6 +312,8 @@ pub struct Edge {
     pub length_mm: Option<f64>,
     /// Share of the length that was measured, 0 to 1.
     pub coverage: f64,
+    /// Share of the length of which only one flank was seen, 0 to 1.
+    pub boundary_share: Option<f64>,
     /// In order of arc length.
     pub stations: Vec<Station>,
     /// The shape of the edge itself, one a stretch of stations; empty where it was not seen.
@@ -357,6 +359,8 @@ pub struct Station {
     pub u_included_angle_deg: Option<f64>,
     /// Distance of the measured edge from the nominal one across the tangent, and its standard uncertainty.
     pub total_mm: Option<Value>,
+    /// The one flank that was seen, where only one was; then d1, d2 and the rest are null. Null elsewhere.
+    pub boundary: Option<Boundary>,
     /// What the deviation of each flank was modelled by.
     pub flank_models: Option<[FlankModel; 2]>,
     /// The highest place of the real profile along the bisector; null where the edge itself was not seen.
@@ -432,6 +436,20 @@ pub enum FlankModel {
     Displaced,
     /// A bend across the edge as well.
     Bent,
+}
+
+/// A station of which one flank was seen: a boundary of the scan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Boundary {
+    /// The flank that was seen: 1 or 2.
+    pub flank: usize,
+    /// Where its face lies at the nominal edge.
+    pub point: Xyz,
+    /// Its deviation along the normal of its face; judged as d1 or d2.
+    pub d_mm: Value,
+    /// What its uncertainty is made of; only where it was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub budget: Option<Budget>,
 }
 
 /// Another point that stands for the edge at a station.

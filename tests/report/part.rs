@@ -142,6 +142,7 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
         return StationResult {
             station: place,
             measured: None,
+            boundary: None,
             points: [14, 0],
             verdict: Verdict::NotDecidable,
             reason: "no points on flank 2 within 3 mm of the edge".to_owned(),
@@ -161,6 +162,7 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
     let verdict = judge(d_mm, u_mm);
     StationResult {
         station: place,
+        boundary: None,
         measured: Some(Measured {
             point: point + d_mm[0] * normals[0] + d_mm[1] * normals[1],
             d_mm,
@@ -206,6 +208,7 @@ fn edge(index: usize, shape: &Shape, stations: usize, seed: &mut u64) -> EdgeRes
         kind: shape.kind,
         length_mm: shape.length_mm,
         coverage: measured as f64 / stations.len() as f64,
+        boundary_share: 0.0,
         breaks: Vec::new(),
         form: None,
         characteristics: Vec::new(),
