@@ -253,6 +253,10 @@ fn without_value(
                     format!("the radius is below {radius_below_mm:.3} mm"),
                 )
             }
+            (_, BreakShape::Undecided { radius_mm, legs_mm }) => (
+                undecided(quantity, radius_mm, legs_mm, [lower, upper]),
+                "the data do not tell a radius from a chamfer".to_owned(),
+            ),
             (_, BreakShape::Sharp { .. }) => (Verdict::NotOk, "the edge is sharp".to_owned()),
             (_, BreakShape::Round { .. }) => (Verdict::NotOk, "the edge is round".to_owned()),
             (_, BreakShape::Chamfer { .. }) => {
@@ -268,6 +272,26 @@ fn without_value(
         }
     }
     worst
+}
+
+/// Where the shape is not decided an upper limit alone may still be kept, whichever it is: an edge that is broken by little enough.
+fn undecided(
+    quantity: Quantity,
+    radius: Quantified,
+    legs: [Quantified; 2],
+    [lower, upper]: [f64; 2],
+) -> Verdict {
+    let size = match quantity {
+        Quantity::BreakRadius => radius,
+        Quantity::ChamferLeg1 => legs[0],
+        Quantity::ChamferLeg2 => legs[1],
+        _ => return Verdict::NotDecidable,
+    };
+    if lower <= 0.0 && size.value + 2.0 * size.u <= upper {
+        Verdict::Ok
+    } else {
+        Verdict::NotDecidable
+    }
 }
 
 /// The larger, the nearer to a limit or the farther outside.
@@ -387,6 +411,28 @@ mod tests {
         assert_eq!(open.verdict, Verdict::NotDecidable);
         assert_eq!(open.reason, "the radius is below 0.050 mm");
         assert_eq!(open.value, None);
+    }
+
+    #[test]
+    fn a_shape_that_is_not_decided_keeps_an_upper_limit_or_decides_nothing() {
+        let size = |value| Quantified { value, u: 0.005 };
+        let either = [stretch(BreakShape::Undecided {
+            radius_mm: size(0.05),
+            legs_mm: [size(0.04); 2],
+        })];
+        let judged = |quantity, limits| {
+            let limits = Limits::default().with(quantity, limits);
+            let all = characteristics(&edge(&either), &limits, Rule::Simple);
+            let found = all.iter().find(|c| c.quantity == quantity);
+            found.map(|c| c.verdict)
+        };
+        let none = f64::NEG_INFINITY;
+        let radius = Quantity::BreakRadius;
+        assert_eq!(judged(radius, [none, 0.2]), Some(Verdict::Ok));
+        assert_eq!(judged(radius, [none, 0.055]), Some(Verdict::NotDecidable));
+        assert_eq!(judged(radius, [0.02, 0.2]), Some(Verdict::NotDecidable));
+        let leg = Quantity::ChamferLeg2;
+        assert_eq!(judged(leg, [none, 0.2]), Some(Verdict::Ok));
     }
 
     #[test]

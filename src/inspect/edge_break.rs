@@ -89,6 +89,8 @@ struct WedgePoint {
     r: [f64; 2],
     /// Index of its wedge.
     wedge: usize,
+    /// Whether it lies in the transition zone, so that no flank was fitted to it.
+    free: bool,
 }
 
 /// A stretch in wedge coordinates.
@@ -166,7 +168,12 @@ impl Zone<'_> {
         // A point this far off the edge's own size belongs to something else.
         let near =
             d[side].abs() <= self.reach[0].max(self.reach[1]) && along[side] <= self.reach[side];
-        near.then_some(WedgePoint { d, r: p.r, wedge })
+        near.then_some(WedgePoint {
+            d,
+            r: p.r,
+            wedge,
+            free: p.r[side] < own.flanks[side].cut_mm,
+        })
     }
 }
 
@@ -276,7 +283,12 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
         u: q.u * full,
     });
     let (truncation, highest) = match fitted {
-        Fitted::Round { radius } => {
+        Fitted::Round { radius }
+        | Fitted::Undecided {
+            radius,
+            round: true,
+            ..
+        } => {
             let per = 1.0 / cos - 1.0;
             let depth = Quantified {
                 value: per * radius.value,
@@ -291,6 +303,11 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
         Fitted::Chamfer {
             legs: [a, b],
             covariance,
+        }
+        | Fitted::Undecided {
+            legs: [a, b],
+            covariance,
+            ..
         } => {
             let tell = (covariance[0][0] + covariance[1][1] - 2.0 * covariance[0][1])
                 .max(0.0)
@@ -326,6 +343,14 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
     }
 }
 
+/// Legs with their uncertainties.
+fn legs_of(legs: &[f64; 2], covariance: &[[f64; 2]; 2]) -> [Quantified; 2] {
+    [0, 1].map(|i| Quantified {
+        value: legs[i],
+        u: covariance[i][i].max(0.0).sqrt(),
+    })
+}
+
 /// Angle of a chamfer's plane to the first flank, rad, from its legs and the included angle.
 fn chamfer_angle([a, b]: [f64; 2], included_rad: f64) -> f64 {
     let (sin, cos) = included_rad.sin_cos();
@@ -339,6 +364,15 @@ impl Fitted {
                 radius_below_mm: *radius_below,
             },
             Self::Round { radius } => BreakShape::Round { radius_mm: *radius },
+            Self::Undecided {
+                radius,
+                legs,
+                covariance,
+                ..
+            } => BreakShape::Undecided {
+                radius_mm: *radius,
+                legs_mm: legs_of(legs, covariance),
+            },
             Self::Chamfer { legs, covariance } => {
                 let included = std::f64::consts::PI - zone.turn;
                 let angle = |a: f64, b: f64| chamfer_angle([a, b], included);
@@ -376,24 +410,39 @@ impl Fitted {
                     u: radius_below * tangent / ONE_SIDED,
                 }; 2]
             }
-            Self::Round { radius } => {
+            Self::Round { radius }
+            | Self::Undecided {
+                radius,
+                round: true,
+                ..
+            } => {
                 [Quantified {
                     value: radius.value * tangent,
                     u: radius.u * tangent,
                 }; 2]
             }
-            Self::Chamfer { legs, covariance } => [0, 1].map(|i| Quantified {
-                value: legs[i],
-                u: covariance[i][i].max(0.0).sqrt(),
-            }),
+            Self::Chamfer { legs, covariance }
+            | Self::Undecided {
+                legs, covariance, ..
+            } => legs_of(legs, covariance),
         }
     }
 
     fn shape(&self) -> Shape {
         match self {
             Self::Sharp { .. } => Shape::Sharp,
-            Self::Round { radius } => Shape::Round(radius.value),
-            Self::Chamfer { legs, .. } => Shape::Chamfer(legs[0], legs[1]),
+            Self::Round { radius }
+            | Self::Undecided {
+                radius,
+                round: true,
+                ..
+            } => Shape::Round(radius.value),
+            Self::Chamfer { legs, .. } | Self::Undecided { legs, .. } => {
+                Shape::Chamfer(legs[0], legs[1])
+            }
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -419,6 +419,13 @@ pub enum BreakShape {
         /// Angle of the chamfer's plane to flank 1, rad.
         angle_rad: Quantified,
     },
+    /// Broken, but the data do not tell a cylinder from a plane.
+    Undecided {
+        /// The radius if it is a cylinder, mm.
+        radius_mm: Quantified,
+        /// The legs if it is a plane, mm.
+        legs_mm: [Quantified; 2],
+    },
     /// Neither: a burr, an undercut, damage.
     Irregular,
 }

@@ -381,6 +381,11 @@ fn break_from_result(found: &EdgeBreak) -> Option<wire::Break> {
             stretch.chamfer_legs_mm = Some(legs_mm.map(value));
             stretch.chamfer_angle_deg = Some(value_in_degrees(angle_rad));
         }
+        BreakShape::Undecided { radius_mm, legs_mm } => {
+            stretch.shape = wire::Shape::Undecided;
+            stretch.radius_mm = Some(value(radius_mm));
+            stretch.chamfer_legs_mm = Some(legs_mm.map(value));
+        }
         BreakShape::Irregular => {}
     }
     Some(stretch)

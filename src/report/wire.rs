@@ -531,6 +531,8 @@ pub enum Shape {
     Round,
     /// A plane across both flanks.
     Chamfer,
+    /// Broken, and the data do not tell round from chamfer: radius and legs are given, of which one applies.
+    Undecided,
     /// Neither.
     Irregular,
 }

@@ -1,8 +1,8 @@
 //! The uncertainty of an edge break by drawing: new noise on its points and on its flanks, and the same shape fitted again.
 //!
 //! Source: JCGM 101:2008, 5.9. The points are drawn about the shape that was found, the flanks from their covariance. What shape it is is
-//! kept from the measurement. Sizes that follow from a radius or from legs are scaled with these; those of an irregular stretch keep their
-//! first-order uncertainty.
+//! kept from the measurement. Sizes that follow from a radius or from legs are scaled with these; those of an irregular or
+//! undecided stretch keep their first-order uncertainty.
 
 use super::fit::Fitted;
 use super::{Analysis, Found, Quantified, Stretch, WedgePoint, Zone, larger};
@@ -71,7 +71,7 @@ pub(in crate::inspect) fn draw_stretch(
             }
             shape.truncation_mm = scaled(shape.truncation_mm, by[0].max(by[1]));
         }
-        BreakShape::Sharp { .. } | BreakShape::Irregular => {}
+        BreakShape::Sharp { .. } | BreakShape::Undecided { .. } | BreakShape::Irregular => {}
     }
     Some(drawn)
 }
@@ -87,6 +87,7 @@ impl Analysis<'_> {
     fn size_again(&self, draws: &mut Draws) -> Option<[f64; 3]> {
         match &self.fitted {
             Fitted::Sharp { .. } => None,
+            Fitted::Undecided { .. } => None,
             Fitted::Round { radius } => {
                 let [radius] = self.zone.again(self, draws).descend([radius.value])?;
                 Some([radius, 0.0, 0.0])

@@ -19,6 +19,9 @@ const COUNT_MIN: f64 = 5.0;
 /// Standard uncertainties at which a bin lies off a flank: 56 bins are asked, so that a false alarm is rare.
 const LEFT: f64 = 4.0;
 
+/// Bins of a plateau up to which its ends count for much.
+const FEW: usize = 4;
+
 /// A shape is refused where a bin lies off it by this much of the noise of one point: less is form, and no burr or notch.
 const OFF_SHAPE: f64 = 1.5;
 
@@ -144,14 +147,14 @@ impl Profile {
                 u: bins[best].u,
             };
         };
+        // How far the plateau lies below its own best bin shows what bins half on a wall take away, and luck adds. Of a few bins the ends,
+        // which are such, are a large part.
+        let share = if chosen.len() <= FEW { 1.0 } else { 0.5 };
         let weight: f64 = bins[chosen].iter().map(|bin| bin.u.powi(-2)).sum();
-        // How far the plateau lies below its own best bin shows what bins half on a wall take away, and luck adds.
+        let fall = share * (bins[best].height - mean);
         Quantified {
             value: sign * mean,
-            u: weight
-                .sqrt()
-                .recip()
-                .hypot(0.5 * (bins[best].height - mean)),
+            u: weight.sqrt().recip().hypot(fall),
         }
     }
 

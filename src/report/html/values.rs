@@ -103,7 +103,13 @@ fn write_breaks(out: &mut String, edge: &Edge) -> fmt::Result {
         return Ok(());
     }
     out.write_str("<ul class=\"small\">")?;
-    for shape in [Shape::Sharp, Shape::Round, Shape::Chamfer, Shape::Irregular] {
+    for shape in [
+        Shape::Sharp,
+        Shape::Round,
+        Shape::Chamfer,
+        Shape::Undecided,
+        Shape::Irregular,
+    ] {
         let of_shape: Vec<_> = edge.breaks.iter().filter(|b| b.shape == shape).collect();
         if of_shape.is_empty() {
             continue;
@@ -132,6 +138,16 @@ fn write_breaks(out: &mut String, edge: &Edge) -> fmt::Result {
                 let legs = of_shape.iter().filter_map(|b| b.chamfer_legs_mm);
                 let legs = legs.flatten().filter_map(|leg| leg.value);
                 format!("chamfer: legs {}", range(legs.collect()))
+            }
+            Shape::Undecided => {
+                let radii = of_shape.iter().filter_map(|b| b.radius_mm?.value);
+                let legs = of_shape.iter().filter_map(|b| b.chamfer_legs_mm);
+                let legs = legs.flatten().filter_map(|leg| leg.value);
+                format!(
+                    "broken, round or chamfer not to be told: radius {} or legs {}",
+                    range(radii.collect()),
+                    range(legs.collect())
+                )
             }
             Shape::Irregular => {
                 let burrs = of_shape.iter().filter_map(|b| b.burr_mm.value);
