@@ -153,11 +153,11 @@ pub fn measure_edges_drawn<B: Body>(
         };
         let count = flanks.series.len();
         let mut edges = Vec::with_capacity(count);
-        for e in 0..count {
+        for (e, zone) in zones.iter().enumerate() {
             told(e, count);
             let context = (flanks.context)(e);
             let (windows, series) = (&flanks.windows[e], &flanks.series[e]);
-            let mut edge = context.combine(windows, series, &zones[e]);
+            let mut edge = context.combine(windows, series, zone);
             let drawn: Vec<Option<DrawnStation>> = (0..windows.count)
                 .into_par_iter()
                 .map(|k| station(flanks, settings, &pose, how, (e, k)))
@@ -171,7 +171,7 @@ pub fn measure_edges_drawn<B: Body>(
                 }
             }
             let virtual_edges = context.virtual_edges(windows, series);
-            let stretches = context.stretches(windows, series, &zones[e], &virtual_edges);
+            let stretches = context.stretches(windows, series, zone, &virtual_edges);
             let breaks: Vec<_> = stretches
                 .par_iter()
                 .map(|(range, stretch)| {
