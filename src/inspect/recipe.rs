@@ -457,7 +457,7 @@ mod tests {
         for expected in [
             "rule: \"strict\", expected \"simple\", { guard_band = k }",
             "minimum_coverage: 2, expected a number of 0 to 1",
-            "colour: an unknown key, expected one of limits, environment, expansion, rule, edge",
+            "colour: an unknown key, expected one of limits, environment, alignment, expansion, rule, limits_from_pmi, edge",
             "datum_faces: [\"a\"], expected numbers of STEP entities",
             "limits.d_mm: [0.1, -0.1], expected two numbers, the lower limit then the upper",
             "limits.width: an unknown key, expected one of d_mm",
