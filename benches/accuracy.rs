@@ -385,7 +385,7 @@ fn defects(seeds: u64) {
         for radius in [0.2, 0.05] {
             let mut found = Recovered::default();
             let mut below: f64 = 0.0;
-            let mut kinds = [0; 3];
+            let mut kinds = [0; 4];
             broken(
                 solid,
                 edge,
@@ -408,14 +408,18 @@ fn defects(seeds: u64) {
                             kinds[2] += 1;
                             None
                         }
+                        BreakShape::Undecided { .. } => {
+                            kinds[3] += 1;
+                            None
+                        }
                     });
                 },
             );
             found.row(&format!("radius, {name}, mm"), radius);
             if found.other > 0 {
-                let [sharp, chamfer, irregular] = kinds;
+                let [sharp, chamfer, irregular, undecided] = kinds;
                 println!(
-                    "    other: {sharp} sharp (below {below:.3} mm at most), {chamfer} chamfers, {irregular} irregular"
+                    "    other: {sharp} sharp (below {below:.3} mm at most), {chamfer} chamfers, {undecided} undecided, {irregular} irregular"
                 );
             }
         }

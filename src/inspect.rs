@@ -12,9 +12,11 @@ mod collect;
 pub mod compare;
 mod contributions;
 pub mod corner;
+pub mod datums;
 mod edge_break;
 pub mod flank;
 pub mod form;
+mod from_pmi;
 pub mod gap;
 pub mod measure;
 pub mod monte_carlo;
@@ -30,6 +32,7 @@ use glam::DVec3;
 
 pub use align::{AlignOptions, Start, Touch};
 pub use body::Body;
+pub use monte_carlo::MonteCarlo;
 pub use recipe::Recipe;
 pub use result::Inspection;
 
@@ -39,7 +42,8 @@ use body::BodyEdge;
 use characteristic::{EdgeValues, at_station, characteristics};
 use corner::CornerSettings;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges_stepped};
-use quantity::Quantity;
+use monte_carlo::measure_edges_drawn;
+use quantity::{Extent, Limits, Quantity};
 use recipe::{EdgeFacts, EdgeKey, Resolved};
 use result::{EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
 use verdict::judge;
@@ -60,8 +64,22 @@ pub struct Request<'a> {
     pub temperature_c: Option<f64>,
     /// Contacts of a probe with the part, in the frame of the scan.
     pub touches: &'a [Touch],
+    /// How uncertainties are propagated.
+    pub uncertainty: Uncertainty,
     /// Told the name of every stage as it begins.
     pub progress: &'a (dyn Fn(&'static str) + Sync),
+    /// Told how many edges of how many have had their trials.
+    pub trials_done: &'a (dyn Fn(usize, usize) + Sync),
+}
+
+/// How uncertainties are propagated.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Uncertainty {
+    /// By first derivatives (JCGM 100).
+    #[default]
+    FirstOrder,
+    /// By trials (JCGM 101): of d1, d2, the total, the included angle and edge breaks; the rest by first derivatives.
+    MonteCarlo(MonteCarlo),
 }
 
 impl<'a> Request<'a> {
@@ -72,7 +90,9 @@ impl<'a> Request<'a> {
             start,
             temperature_c: None,
             touches: &[],
+            uncertainty: Uncertainty::FirstOrder,
             progress: &|_| {},
+            trials_done: &|_, _| {},
         }
     }
 }
@@ -93,18 +113,29 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let surface = Surface::new(nominal);
     let mut findings = Vec::new();
     let datums = datum_faces(nominal, &request.recipe.datum_faces, &mut findings);
+    let (features, unknown) = datums::datum_features(nominal, &request.recipe.datums);
+    findings.extend(unknown.iter().map(|datum| {
+        format!(
+            "recipe: alignment: datum {:?}: {}, expected {}; nothing is decided without it",
+            datum.name, datum.found, datum.expected
+        )
+    }));
     let options = AlignOptions {
         datum_faces: &datums,
+        datums: if unknown.is_empty() { &features } else { &[] },
         touches: request.touches,
         held: request.recipe.held,
         ..AlignOptions::default()
     };
     let Aligned {
-        alignment,
+        mut alignment,
         findings: of_alignment,
         ..
     } = align(&scan, &surface, request.start, &options);
     findings.extend(of_alignment);
+    if !unknown.is_empty() {
+        alignment.status = Verdict::NotDecidable;
+    }
 
     stages.begin("faces of the points");
     let pose = alignment.part_from_machine;
@@ -125,9 +156,21 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         expansion: expansion(request, &mut findings),
     };
     let facts = all_edge_facts(nominal);
-    let resolved = resolve(&facts, request.recipe, &mut findings);
+    let (resolved, of_recipe) = resolve(nominal, &facts, request.recipe);
+    findings.extend(of_recipe);
     let steps: Vec<Option<f64>> = resolved.iter().map(|r| r.station_step_mm).collect();
-    let measured = measure_edges_stepped(&part, &places, &surface, &settings, &steps);
+    let (measured, trials) = match &request.uncertainty {
+        Uncertainty::FirstOrder => {
+            let edges = measure_edges_stepped(&part, &places, &surface, &settings, &steps);
+            (edges, None)
+        }
+        Uncertainty::MonteCarlo(how) => {
+            let given = (&settings, &steps[..]);
+            let told = request.trials_done;
+            let (edges, trials) = measure_edges_drawn(&part, &places, &surface, given, how, told);
+            (edges, Some(trials))
+        }
+    };
     stages.begin("comparison of edges found");
     let known = (scan.spacing, scan.noise_mm);
     let detection = features::detect_knowing(cloud, &neighbors, known, Method::Adaptive);
@@ -176,6 +219,7 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         unexpected_edges: compared.unexpected,
         missing_edges: compared.missing,
         verdict,
+        trials,
         seconds: stages.end(),
         findings,
         scan: Some(ScanEstimate {
@@ -215,8 +259,14 @@ fn edge_facts<B: Body>(nominal: &B, index: usize, edge: &BodyEdge) -> EdgeFacts 
     facts
 }
 
-/// What the recipe says of every edge; an entry that means none becomes a finding, a name for several gets their ids behind it.
-fn resolve(facts: &[EdgeFacts], recipe: &Recipe, findings: &mut Vec<String>) -> Vec<Resolved> {
+/// What holds for every edge of `facts`, by the recipe and where it asks for them by the nominal's own tolerances, and findings: an entry
+/// that means no edge, a tolerance that gives no limit. A name for several edges gets their ids behind it.
+pub fn resolve<B: Body>(
+    nominal: &B,
+    facts: &[EdgeFacts],
+    recipe: &Recipe,
+) -> (Vec<Resolved>, Vec<String>) {
+    let mut findings = Vec::new();
     for entry in &recipe.edges {
         if !facts.iter().any(|edge| entry.select.means(edge)) {
             findings.push(format!(
@@ -225,7 +275,17 @@ fn resolve(facts: &[EdgeFacts], recipe: &Recipe, findings: &mut Vec<String>) -> 
             ));
         }
     }
-    let mut resolved: Vec<Resolved> = facts.iter().map(|edge| recipe.of(edge)).collect();
+    let mut by_nominal = vec![Limits::default(); facts.len()];
+    if recipe.limits_from_pmi {
+        let (limits, unused) = from_pmi::limits_from_pmi(nominal, facts, &recipe.datums);
+        by_nominal = limits;
+        findings.extend(unused);
+    }
+    let mut resolved: Vec<Resolved> = facts
+        .iter()
+        .zip(by_nominal)
+        .map(|(edge, by_nominal)| recipe.of_edge(edge, by_nominal))
+        .collect();
     let names: Vec<Option<String>> = resolved.iter().map(|edge| edge.name.clone()).collect();
     for (edge, facts) in resolved.iter_mut().zip(facts) {
         let shared = names.iter().filter(|name| **name == edge.name).count() > 1;
@@ -233,7 +293,7 @@ fn resolve(facts: &[EdgeFacts], recipe: &Recipe, findings: &mut Vec<String>) -> 
             *name = format!("{name} {}", facts.id);
         }
     }
-    resolved
+    (resolved, findings)
 }
 
 /// Missing edges count where they have limits, unexpected ones where the recipe says so.
@@ -345,6 +405,7 @@ fn judged(
             let mut station = StationResult {
                 station: s.station,
                 measured,
+                boundary: s.boundary,
                 points: s.points,
                 verdict: Verdict::Undefined,
                 reason,
@@ -353,7 +414,23 @@ fn judged(
             station
         })
         .collect();
-    let coverage = stations.iter().filter(|s| s.measured.is_some()).count() as f64 / total as f64;
+    let share = |of: &dyn Fn(&StationResult) -> bool| {
+        stations.iter().filter(|s| of(s)).count() as f64 / total as f64
+    };
+    let coverage = share(&|s| s.measured.is_some());
+    let boundary_share = share(&|s| s.boundary.is_some());
+    // Where limits ask for nothing but what a boundary shows, its stations answer for the edge.
+    let asked_here: Vec<Quantity> = Quantity::all()
+        .filter(|q| q.extent() == Extent::Station && asked.limits.of(*q).is_some())
+        .collect();
+    let answered = share(&|s| {
+        s.measured.is_some()
+            || (s.boundary.is_some()
+                && !asked_here.is_empty()
+                && asked_here
+                    .iter()
+                    .all(|q| at_station(s, edge.kind, *q).is_some()))
+    });
     let form = form::form(&stations, recipe.direction_mm);
     let values = EdgeValues {
         kind: edge.kind,
@@ -364,7 +441,7 @@ fn judged(
     let characteristics = characteristics(&values, &asked.limits, recipe.rule);
     let verdict = verdict::judge_edge(
         characteristics.iter().map(|c| c.verdict),
-        coverage,
+        answered,
         recipe.minimum_coverage,
         !asked.limits.is_empty(),
     );
@@ -374,6 +451,7 @@ fn judged(
         kind: edge.kind,
         length_mm: edge.length_mm,
         coverage,
+        boundary_share,
         stations,
         breaks: measured.breaks,
         form,
@@ -400,6 +478,9 @@ fn judge_station(station: &mut StationResult, edge: &BodyEdge, asked: &Resolved,
         station.verdict = station.verdict.max(verdict);
     }
     if station.verdict == Verdict::NotDecidable {
+        if !station.reason.is_empty() {
+            reasons.insert(0, std::mem::take(&mut station.reason));
+        }
         station.reason = reasons.join("; ");
     }
 }

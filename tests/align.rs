@@ -4,6 +4,9 @@
 #[path = "inspect/solids.rs"]
 mod solids;
 
+#[path = "align/datums.rs"]
+mod datums;
+
 use acies::geometry::RigidTransform;
 use acies::geometry::fit::invert_spd;
 use acies::inspect::align::datum::{Datum, DatumError, pose_from_datums};

@@ -1,5 +1,7 @@
 //! Every definition of an edge's characteristics against edges whose truth is exact.
 
+#[path = "edges/drawn.rs"]
+mod drawn;
 #[path = "edges/freeform.rs"]
 mod freeform;
 #[path = "edges/part.rs"]

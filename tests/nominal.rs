@@ -6,6 +6,8 @@ mod closest;
 mod hostile;
 #[path = "nominal/iges.rs"]
 mod iges;
+#[path = "nominal/pmi.rs"]
+mod pmi;
 
 use std::collections::BTreeSet;
 use std::f64::consts::{FRAC_PI_2, PI, TAU};
@@ -456,6 +458,7 @@ fn the_dimensions_of_a_nist_file_are_those_of_its_drawing() {
         what,
         zone_mm,
         datums,
+        ..
     } = &position.kind
     else {
         panic!("{position:?}")

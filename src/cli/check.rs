@@ -98,6 +98,11 @@ fn check_part(cell: &Cell) -> Result<(), Vec<LocatedMistake>> {
                 "a face of the nominal",
             )
         });
+    let (_, unknown) = crate::inspect::datums::datum_features(&nominal, &recipe.datums);
+    let datums = unknown.into_iter().map(|datum| {
+        let key = format!("alignment.datum {:?}", datum.name);
+        told(recipe_file, &key, datum.found, &datum.expected)
+    });
     let edges = recipe
         .edges
         .iter()
@@ -110,7 +115,7 @@ fn check_part(cell: &Cell) -> Result<(), Vec<LocatedMistake>> {
                 "a sharp edge of the nominal",
             )
         });
-    let mistakes: Vec<LocatedMistake> = faces.chain(edges).collect();
+    let mistakes: Vec<LocatedMistake> = faces.chain(datums).chain(edges).collect();
     if mistakes.is_empty() {
         Ok(())
     } else {

@@ -73,7 +73,12 @@ struct PmiRow {
     deviations: Option<[f64; 2]>,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     datums: Vec<String>,
+    /// Only where its zone lies unevenly about the nominal.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    unequal: bool,
     faces: Vec<u64>,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    edges: Vec<u64>,
 }
 
 impl PmiRow {
@@ -87,7 +92,9 @@ impl PmiRow {
             unit: None,
             deviations: None,
             datums: Vec::new(),
+            unequal: false,
             faces: p.faces.clone(),
+            edges: p.edges.clone(),
         };
         match &p.kind {
             PmiKind::Dimension {
@@ -109,7 +116,9 @@ impl PmiRow {
                 what,
                 zone_mm,
                 datums,
+                unequal,
             } => {
+                row.unequal = *unequal;
                 row.kind = "tolerance";
                 row.what = Some(what.clone());
                 row.value = Some(*zone_mm);

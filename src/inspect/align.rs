@@ -6,10 +6,12 @@
 //! from edges. A start is found by a search over all poses that what is known leaves open. Then each face
 //! and each patch of a face is asked whether it departs from its nominal by more than noise, and the covariance grows by
 //! what is found. Directions that the data do not hold are left alone and named; a pose that another one rivals, that leaves
-//! the scan off the nominal, or that fits a mirrored scan better is no answer.
+//! the scan off the nominal, or that fits a mirrored scan better is no answer. Where datum features are asked for, the pose then moves
+//! onto them.
 
 mod check;
 pub mod datum;
+mod features;
 mod form;
 mod scene;
 mod search;
@@ -22,7 +24,7 @@ use rayon::prelude::*;
 use super::assign::{NO_FACE, Surface, towards};
 use super::body::Body;
 use super::measure::pose_row;
-use super::result::{Alignment, Verdict};
+use super::result::{Alignment, Method, Verdict};
 use crate::geometry::RigidTransform;
 use crate::geometry::fit::{mad_sigma, median};
 use crate::points::{Neighbors, PointCloud, Spacing};
@@ -30,7 +32,8 @@ use form::{form, patch_of};
 use scene::Scene;
 use search::Pose;
 
-pub use datum::{Datum, DatumPose, pose_from_datums};
+pub use datum::{Datum, DatumPose, pose_from_datums, pose_from_ordered_datums};
+pub use features::{DatumFeature, DatumPlace};
 pub use twist::Twist;
 
 /// Points of the last step: more do not make the pose better than anything else is known.
@@ -104,6 +107,8 @@ pub struct Touch {
 pub struct AlignOptions<'a> {
     /// Indices of the faces that hold the pose; empty = all.
     pub datum_faces: &'a [u32],
+    /// Features that the pose is to rest on; empty = the best fit stands.
+    pub datums: &'a [DatumFeature],
     /// Contacts of a probe, as further observations.
     pub touches: &'a [Touch],
     /// How far a rough start may be off.
@@ -130,6 +135,8 @@ pub enum Conclusion {
     Misfit,
     /// The mirrored scan fits better.
     Mirrored,
+    /// A datum feature that was asked for could not be measured.
+    NoDatum,
 }
 
 /// A pose with what is to be said of it.
@@ -172,7 +179,7 @@ pub fn align<B: Body>(
             "alignment: held degrees of freedom but no start, expected the pose they are held at; give a rough start"
                 .to_string(),
         ),
-        _ => task.find(start, holds),
+        _ => task.on_datums(task.find(start, holds)),
     }
 }
 
@@ -241,6 +248,15 @@ struct Task<'a, B: Body> {
 }
 
 impl<B: Body> Task<'_, B> {
+    /// A best fit on the faces asked for, without anything found.
+    fn unexplained(&self) -> Alignment {
+        let faces = self.options.datum_faces.iter();
+        Alignment {
+            faces: faces.map(|f| self.surface.body.face_entity(*f)).collect(),
+            ..Alignment::default()
+        }
+    }
+
     fn failed(&self, finding: String) -> Aligned {
         let mut covariance = [[0.0; 6]; 6];
         for (i, row) in covariance.iter_mut().enumerate() {
@@ -254,6 +270,7 @@ impl<B: Body> Task<'_, B> {
                 covariance,
                 weak_directions: Vec::new(),
                 status: Verdict::NotDecidable,
+                ..self.unexplained()
             },
             findings: vec![finding],
             conclusion: Conclusion::NotFound,
@@ -275,8 +292,16 @@ impl<B: Body> Task<'_, B> {
                 covariance: [[0.0; 6]; 6],
                 weak_directions: Vec::new(),
                 status: Verdict::Ok,
+                method: Method::AsGiven,
+                ..self.unexplained()
             },
-            findings: Vec::new(),
+            findings: if self.options.datums.is_empty() {
+                Vec::new()
+            } else {
+                vec![
+                    "alignment: the scan is taken as it lies, so that the recipe's datums hold nothing; ask for an alignment".to_owned(),
+                ]
+            },
             conclusion: Conclusion::AsGiven,
             eigenvalues: [0.0; 6],
         }
@@ -636,6 +661,7 @@ impl<B: Body> Task<'_, B> {
                 covariance: self.covariance(observations, step),
                 weak_directions: twist::words(&self.twists(step), self.size_mm),
                 status: Verdict::Ok,
+                ..self.unexplained()
             },
             findings: Vec::new(),
             conclusion: Conclusion::Good,

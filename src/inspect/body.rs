@@ -2,7 +2,8 @@
 
 use glam::DVec3;
 
-use crate::nominal::{EdgeKind, Foot, Nominal, Station};
+use crate::geometry::Surface;
+use crate::nominal::{EdgeKind, Foot, Nominal, Pmi, Station};
 
 /// A place on a face.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -34,6 +35,17 @@ pub struct BodyEdge {
     pub closed: bool,
 }
 
+/// What a face holds as a datum feature, in the part frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum DatumShape {
+    /// A plane.
+    Plane,
+    /// A cylinder or cone: a place on its axis, mm, and its unit direction.
+    Axis(DVec3, DVec3),
+    /// A sphere: its centre, mm.
+    Centre(DVec3),
+}
+
 /// A nominal part, in mm, in the part frame.
 pub trait Body: Sync {
     /// Number of faces.
@@ -53,6 +65,15 @@ pub trait Body: Sync {
     fn station(&self, edge: usize, s_mm: f64) -> Station;
     /// Smallest and largest coordinates, mm.
     fn bounds(&self) -> [DVec3; 2];
+    /// What a face holds as a datum feature; `None` for a free-form face, or where nobody knows.
+    fn datum_shape(&self, face: u32) -> Option<DatumShape> {
+        let _ = face;
+        None
+    }
+    /// Dimensions, tolerances and datum features that come with the nominal.
+    fn pmi(&self) -> &[Pmi] {
+        &[]
+    }
 }
 
 impl Body for Nominal {
@@ -104,5 +125,20 @@ impl Body for Nominal {
 
     fn bounds(&self) -> [DVec3; 2] {
         self.bounding_box_mm
+    }
+
+    fn datum_shape(&self, face: u32) -> Option<DatumShape> {
+        match &self.faces[face as usize].surface {
+            Surface::Plane(_) => Some(DatumShape::Plane),
+            Surface::Cylinder { frame, .. } | Surface::Cone { frame, .. } => {
+                Some(DatumShape::Axis(frame.origin, frame.z))
+            }
+            Surface::Sphere { frame, .. } => Some(DatumShape::Centre(frame.origin)),
+            Surface::Torus { .. } | Surface::Swept(_) | Surface::Nurbs(_) => None,
+        }
+    }
+
+    fn pmi(&self) -> &[Pmi] {
+        Nominal::pmi(self)
     }
 }

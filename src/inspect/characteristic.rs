@@ -2,7 +2,7 @@
 //!
 //! Source: features-and-standards, section 5, characteristics 22 (worst point), 24 (statistics), 25 (verdict).
 
-use super::quantity::{Extent, Limits, Quantity};
+use super::quantity::{Extent, LimitSource, Limits, Quantity};
 use super::recipe::Rule;
 use super::result::{BreakShape, EdgeBreak, EdgeForm, Quantified, StationResult, Verdict};
 use super::verdict::judge;
@@ -20,6 +20,8 @@ pub struct Characteristic {
     pub s_mm: Option<f64>,
     /// Lower and upper limit.
     pub limits: Option<[f64; 2]>,
+    /// Where they come from.
+    pub limits_from: Option<LimitSource>,
     /// Worst verdict of all its values.
     pub verdict: Verdict,
     /// Why it has no value, or why it is not decidable; empty otherwise.
@@ -73,10 +75,14 @@ pub struct EdgeValues<'a> {
 pub fn characteristics(edge: &EdgeValues<'_>, limits: &Limits, rule: Rule) -> Vec<Characteristic> {
     Quantity::all()
         .filter_map(|quantity| {
+            let source = limits.source(quantity);
             let limits = limits.of(quantity);
             let samples = samples(edge, quantity);
             let wanted = always(quantity) || !samples.is_empty() || limits.is_some();
-            wanted.then(|| of_samples(edge, quantity, &samples, limits, rule))
+            wanted.then(|| Characteristic {
+                limits_from: source,
+                ..of_samples(edge, quantity, &samples, limits, rule)
+            })
         })
         .collect()
 }
@@ -89,12 +95,16 @@ fn always(quantity: Quantity) -> bool {
     )
 }
 
-/// `quantity` at one station; `None` where it was not measured, or belongs to no station.
+/// `quantity` at one station; `None` where it was not measured, or belongs to no station. A boundary has the d of the flank that was seen.
 pub fn at_station(
     station: &StationResult,
     kind: EdgeKind,
     quantity: Quantity,
 ) -> Option<Quantified> {
+    if let Some(boundary) = &station.boundary {
+        let own = [Quantity::D1, Quantity::D2][boundary.flank];
+        return (quantity == own).then_some(boundary.d_mm);
+    }
     let measured = station.measured.as_ref()?;
     let d = |i: usize| Quantified {
         value: measured.d_mm[i],
@@ -201,6 +211,7 @@ fn of_samples(
         value: worst.map(|worst| worst.value),
         s_mm: worst.and_then(|worst| worst.s_mm),
         limits,
+        limits_from: None,
         verdict,
         reason,
         statistics: statistics(samples.iter().map(|s| s.value.value), limits),
@@ -242,6 +253,10 @@ fn without_value(
                     format!("the radius is below {radius_below_mm:.3} mm"),
                 )
             }
+            (_, BreakShape::Undecided { radius_mm, legs_mm }) => (
+                undecided(quantity, radius_mm, legs_mm, [lower, upper]),
+                "the data do not tell a radius from a chamfer".to_owned(),
+            ),
             (_, BreakShape::Sharp { .. }) => (Verdict::NotOk, "the edge is sharp".to_owned()),
             (_, BreakShape::Round { .. }) => (Verdict::NotOk, "the edge is round".to_owned()),
             (_, BreakShape::Chamfer { .. }) => {
@@ -257,6 +272,26 @@ fn without_value(
         }
     }
     worst
+}
+
+/// Where the shape is not decided an upper limit alone may still be kept, whichever it is: an edge that is broken by little enough.
+fn undecided(
+    quantity: Quantity,
+    radius: Quantified,
+    legs: [Quantified; 2],
+    [lower, upper]: [f64; 2],
+) -> Verdict {
+    let size = match quantity {
+        Quantity::BreakRadius => radius,
+        Quantity::ChamferLeg1 => legs[0],
+        Quantity::ChamferLeg2 => legs[1],
+        _ => return Verdict::NotDecidable,
+    };
+    if lower <= 0.0 && size.value + 2.0 * size.u <= upper {
+        Verdict::Ok
+    } else {
+        Verdict::NotDecidable
+    }
 }
 
 /// The larger, the nearer to a limit or the farther outside.
@@ -376,6 +411,28 @@ mod tests {
         assert_eq!(open.verdict, Verdict::NotDecidable);
         assert_eq!(open.reason, "the radius is below 0.050 mm");
         assert_eq!(open.value, None);
+    }
+
+    #[test]
+    fn a_shape_that_is_not_decided_keeps_an_upper_limit_or_decides_nothing() {
+        let size = |value| Quantified { value, u: 0.005 };
+        let either = [stretch(BreakShape::Undecided {
+            radius_mm: size(0.05),
+            legs_mm: [size(0.04); 2],
+        })];
+        let judged = |quantity, limits| {
+            let limits = Limits::default().with(quantity, limits);
+            let all = characteristics(&edge(&either), &limits, Rule::Simple);
+            let found = all.iter().find(|c| c.quantity == quantity);
+            found.map(|c| c.verdict)
+        };
+        let none = f64::NEG_INFINITY;
+        let radius = Quantity::BreakRadius;
+        assert_eq!(judged(radius, [none, 0.2]), Some(Verdict::Ok));
+        assert_eq!(judged(radius, [none, 0.055]), Some(Verdict::NotDecidable));
+        assert_eq!(judged(radius, [0.02, 0.2]), Some(Verdict::NotDecidable));
+        let leg = Quantity::ChamferLeg2;
+        assert_eq!(judged(leg, [none, 0.2]), Some(Verdict::Ok));
     }
 
     #[test]

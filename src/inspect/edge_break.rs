@@ -6,11 +6,13 @@
 //!
 //! Source: features-and-standards, section 5, characteristics 6 to 12.
 
+mod draw;
 mod fit;
 mod profile;
 
 use super::flank::FlankFit;
 use super::result::{BreakShape, EdgeBreak, Quantified};
+pub(super) use draw::draw_stretch;
 use fit::{Fitted, Shape, choose};
 use profile::Profile;
 
@@ -87,6 +89,8 @@ struct WedgePoint {
     r: [f64; 2],
     /// Index of its wedge.
     wedge: usize,
+    /// Whether it lies in the transition zone, so that no flank was fitted to it.
+    free: bool,
 }
 
 /// A stretch in wedge coordinates.
@@ -164,61 +168,100 @@ impl Zone<'_> {
         // A point this far off the edge's own size belongs to something else.
         let near =
             d[side].abs() <= self.reach[0].max(self.reach[1]) && along[side] <= self.reach[side];
-        near.then_some(WedgePoint { d, r: p.r, wedge })
+        near.then_some(WedgePoint {
+            d,
+            r: p.r,
+            wedge,
+            free: p.r[side] < own.flanks[side].cut_mm,
+        })
     }
+}
+
+/// A stretch with the shape that was chosen for it.
+struct Analysis<'a> {
+    zone: Zone<'a>,
+    fitted: Fitted,
+    profile: Profile,
+    /// Whether the profile refuses the shape.
+    irregular: bool,
+}
+
+impl<'a> Analysis<'a> {
+    /// `None` where too few points lie near the edge, or the flanks are one plane.
+    fn new(stretch: &'a Stretch<'a>) -> Option<Self> {
+        let zone = stretch.zone()?;
+        let fitted = choose(&zone);
+        let profile = Profile::new(&zone);
+        let irregular = profile.departs_from(&zone, &fitted.shape());
+        Some(Self {
+            zone,
+            fitted,
+            profile,
+            irregular,
+        })
+    }
+
+    fn found(&self) -> Option<Found> {
+        let stretch = self.zone.stretch;
+        let first = stretch.wedges.first()?;
+        let last = stretch.wedges.last()?;
+        let mut form = if self.irregular {
+            self.profile.form()
+        } else {
+            of_model(&self.zone, &self.fitted)
+        };
+        if !self.irregular {
+            // An excess beside a shape that fits otherwise.
+            form.excess = self.profile.excess();
+        }
+        let passing = larger(form.excess);
+        let largest = if form.missing[0].value >= form.missing[1].value {
+            form.missing[0]
+        } else {
+            form.missing[1]
+        };
+        let shape = EdgeBreak {
+            s_mm: [
+                first.s - 0.5 * stretch.step_mm,
+                last.s + 0.5 * stretch.step_mm,
+            ],
+            shape: if self.irregular {
+                BreakShape::Irregular
+            } else {
+                self.fitted.outer(&self.zone)
+            },
+            detachment_mm: form.detachment,
+            truncation_mm: form.truncation,
+            // A concave edge has its excess where a convex one misses material.
+            burr_mm: if stretch.convex { passing } else { largest },
+            undercut_mm: if stretch.convex {
+                form.missing
+            } else {
+                form.excess
+            },
+            points: self.zone.points.len(),
+        };
+        Some(Found {
+            shape,
+            highest: form.highest.map(|x| self.zone.sign * x),
+        })
+    }
+}
+
+/// The larger of two excesses; where there is none, none with the uncertainty of the first.
+fn larger(excess: [Quantified; 2]) -> Quantified {
+    let nothing = Quantified {
+        value: 0.0,
+        u: excess[0].u,
+    };
+    excess
+        .into_iter()
+        .fold(nothing, |a, b| if b.value > a.value { b } else { a })
 }
 
 /// The shape of one stretch; `None` where too few points lie near the edge, or the flanks are one plane.
 pub(super) fn measure_stretch(stretch: &Stretch<'_>) -> Option<Found> {
-    let zone = stretch.zone()?;
-    let fitted = choose(&zone);
-    let profile = Profile::new(&zone);
-    let irregular = profile.departs_from(&zone, &fitted.shape());
-    let first = stretch.wedges.first()?;
-    let last = stretch.wedges.last()?;
-    let mut form = if irregular {
-        profile.form()
-    } else {
-        of_model(&zone, &fitted)
-    };
-    if !irregular {
-        // An excess beside a shape that fits otherwise.
-        form.excess = profile.excess();
-    }
-    let passing = form.excess.iter().copied().fold(
-        Quantified {
-            value: 0.0,
-            u: form.excess[0].u,
-        },
-        |a, b| if b.value > a.value { b } else { a },
-    );
-    let missing = form.missing;
-    let largest = if missing[0].value >= missing[1].value {
-        missing[0]
-    } else {
-        missing[1]
-    };
-    let shape = EdgeBreak {
-        s_mm: [
-            first.s - 0.5 * stretch.step_mm,
-            last.s + 0.5 * stretch.step_mm,
-        ],
-        shape: if irregular {
-            BreakShape::Irregular
-        } else {
-            fitted.outer(&zone)
-        },
-        detachment_mm: form.detachment,
-        truncation_mm: form.truncation,
-        // A concave edge has its excess where a convex one misses material.
-        burr_mm: if stretch.convex { passing } else { largest },
-        undercut_mm: if stretch.convex { missing } else { form.excess },
-        points: zone.points.len(),
-    };
-    Some(Found {
-        shape,
-        highest: form.highest.map(|x| zone.sign * x),
-    })
+    Analysis::new(stretch)?.found()
 }
 
 /// The sizes that every shape has, for a convex edge.
@@ -240,7 +283,12 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
         u: q.u * full,
     });
     let (truncation, highest) = match fitted {
-        Fitted::Round { radius } => {
+        Fitted::Round { radius }
+        | Fitted::Undecided {
+            radius,
+            round: true,
+            ..
+        } => {
             let per = 1.0 / cos - 1.0;
             let depth = Quantified {
                 value: per * radius.value,
@@ -255,6 +303,11 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
         Fitted::Chamfer {
             legs: [a, b],
             covariance,
+        }
+        | Fitted::Undecided {
+            legs: [a, b],
+            covariance,
+            ..
         } => {
             let tell = (covariance[0][0] + covariance[1][1] - 2.0 * covariance[0][1])
                 .max(0.0)
@@ -290,6 +343,20 @@ fn of_model(zone: &Zone<'_>, fitted: &Fitted) -> Form {
     }
 }
 
+/// Legs with their uncertainties.
+fn legs_of(legs: &[f64; 2], covariance: &[[f64; 2]; 2]) -> [Quantified; 2] {
+    [0, 1].map(|i| Quantified {
+        value: legs[i],
+        u: covariance[i][i].max(0.0).sqrt(),
+    })
+}
+
+/// Angle of a chamfer's plane to the first flank, rad, from its legs and the included angle.
+fn chamfer_angle([a, b]: [f64; 2], included_rad: f64) -> f64 {
+    let (sin, cos) = included_rad.sin_cos();
+    (b * sin).atan2(a - b * cos)
+}
+
 impl Fitted {
     fn outer(&self, zone: &Zone<'_>) -> BreakShape {
         match self {
@@ -297,14 +364,23 @@ impl Fitted {
                 radius_below_mm: *radius_below,
             },
             Self::Round { radius } => BreakShape::Round { radius_mm: *radius },
+            Self::Undecided {
+                radius,
+                legs,
+                covariance,
+                ..
+            } => BreakShape::Undecided {
+                radius_mm: *radius,
+                legs_mm: legs_of(legs, covariance),
+            },
             Self::Chamfer { legs, covariance } => {
                 let included = std::f64::consts::PI - zone.turn;
-                let angle = |a: f64, b: f64, phi: f64| (b * phi.sin()).atan2(a - b * phi.cos());
+                let angle = |a: f64, b: f64| chamfer_angle([a, b], included);
                 let [a, b] = *legs;
                 let step = 1e-4 * a.min(b);
                 let by = [
-                    (angle(a + step, b, included) - angle(a - step, b, included)) / (2.0 * step),
-                    (angle(a, b + step, included) - angle(a, b - step, included)) / (2.0 * step),
+                    (angle(a + step, b) - angle(a - step, b)) / (2.0 * step),
+                    (angle(a, b + step) - angle(a, b - step)) / (2.0 * step),
                 ];
                 let variance = (0..2)
                     .map(|i| {
@@ -316,7 +392,7 @@ impl Fitted {
                 BreakShape::Chamfer {
                     legs_mm: self.legs(zone.turn),
                     angle_rad: Quantified {
-                        value: angle(a, b, included),
+                        value: angle(a, b),
                         u: variance.max(0.0).sqrt(),
                     },
                 }
@@ -334,24 +410,39 @@ impl Fitted {
                     u: radius_below * tangent / ONE_SIDED,
                 }; 2]
             }
-            Self::Round { radius } => {
+            Self::Round { radius }
+            | Self::Undecided {
+                radius,
+                round: true,
+                ..
+            } => {
                 [Quantified {
                     value: radius.value * tangent,
                     u: radius.u * tangent,
                 }; 2]
             }
-            Self::Chamfer { legs, covariance } => [0, 1].map(|i| Quantified {
-                value: legs[i],
-                u: covariance[i][i].max(0.0).sqrt(),
-            }),
+            Self::Chamfer { legs, covariance }
+            | Self::Undecided {
+                legs, covariance, ..
+            } => legs_of(legs, covariance),
         }
     }
 
     fn shape(&self) -> Shape {
         match self {
             Self::Sharp { .. } => Shape::Sharp,
-            Self::Round { radius } => Shape::Round(radius.value),
-            Self::Chamfer { legs, .. } => Shape::Chamfer(legs[0], legs[1]),
+            Self::Round { radius }
+            | Self::Undecided {
+                radius,
+                round: true,
+                ..
+            } => Shape::Round(radius.value),
+            Self::Chamfer { legs, .. } | Self::Undecided { legs, .. } => {
+                Shape::Chamfer(legs[0], legs[1])
+            }
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -326,6 +326,7 @@ mod tests {
                 ridge: None,
                 at_depth: [None; 2],
             }),
+            boundary: None,
             points: [100; 2],
             verdict: Verdict::Undefined,
             reason: String::new(),

@@ -1,5 +1,7 @@
 //! Every sharp edge of the nominal, measured station by station on an aligned scan.
 
+use std::ops::Range;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -11,7 +13,9 @@ use super::edge_break::{self, Found, POINTS_MAX, STRETCH, Stretch, Wedge, ZonePo
 use super::flank::{
     FlankFit, FlankGap, FlankModel, FlankSeries, FlankSettings, Windows, measure_flank,
 };
-use super::result::{Budget, DepthPoint, EdgeBreak, EdgeMean, EdgePoint, Measured, Quantified};
+use super::result::{
+    Boundary, Budget, DepthPoint, EdgeBreak, EdgeMean, EdgePoint, Measured, Quantified,
+};
 use super::virtual_edge::{VirtualEdge, intersect, nominal_angle};
 use crate::nominal::{EdgeKind, Station};
 use crate::points::PointCloud;
@@ -78,6 +82,8 @@ pub struct MeasuredStation {
     pub station: Station,
     /// What was measured, or why not.
     pub outcome: Result<Measured, String>,
+    /// The one flank that was seen, where only one was.
+    pub boundary: Option<Boundary>,
     /// Points used on each flank.
     pub points: [usize; 2],
 }
@@ -203,7 +209,7 @@ fn centre(scene: &Scene<'_>) -> DVec3 {
 
 impl<B: Body> Flanks<'_, B> {
     /// The points of every edge's transition zone.
-    fn zones(&self) -> Vec<Vec<ZonePoint>> {
+    pub(super) fn zones(&self) -> Vec<Vec<ZonePoint>> {
         let radius = |pair: &[FlankSeries; 2]| {
             let fits = || pair.iter().flat_map(|s| s.stations.iter().flatten());
             let cut = fits().map(|f| f.cut_mm).fold(0.0, f64::max);
@@ -374,7 +380,7 @@ pub(super) struct EdgeContext<'a, B: Body> {
 }
 
 impl<B: Body> EdgeContext<'_, B> {
-    fn combine(
+    pub(super) fn combine(
         &self,
         windows: &Windows,
         series: &[FlankSeries; 2],
@@ -408,9 +414,15 @@ impl<B: Body> EdgeContext<'_, B> {
                 _ => Err(self.reason(flanks)),
             };
             edges.push(edge);
+            let boundary = match flanks {
+                [Ok(seen), Err(_)] => Some(self.boundary(&station, seen, 0)),
+                [Err(_), Ok(seen)] => Some(self.boundary(&station, seen, 1)),
+                _ => None,
+            };
             stations.push(MeasuredStation {
                 station,
                 outcome,
+                boundary,
                 points,
             });
         }
@@ -425,6 +437,21 @@ impl<B: Body> EdgeContext<'_, B> {
 
     pub(super) fn station(&self, windows: &Windows, k: usize) -> Station {
         self.body.station(self.index, windows.centre(k))
+    }
+
+    /// Where the flanks of every station meet.
+    pub(super) fn virtual_edges(
+        &self,
+        windows: &Windows,
+        series: &[FlankSeries; 2],
+    ) -> Vec<Option<VirtualEdge>> {
+        let of = |k: usize| match (&series[0].stations[k], &series[1].stations[k]) {
+            (Ok(first), Ok(second)) => {
+                self.virtual_edge(&self.station(windows, k), [first, second])
+            }
+            _ => None,
+        };
+        (0..windows.count).map(of).collect()
     }
 
     pub(super) fn virtual_edge(
@@ -500,6 +527,29 @@ impl<B: Body> EdgeContext<'_, B> {
         }
     }
 
+    /// The deviation of the one flank that was seen, at the nominal edge.
+    fn boundary(&self, station: &Station, seen: &FlankFit, flank: usize) -> Boundary {
+        let n = station.normals[flank];
+        let point = station.point + seen.offset_mm * n;
+        let correction = self.shared.correction(point);
+        let [alignment, temperature] = self.shared.u(&self.shared.response(point, n));
+        let budget = Budget {
+            points: seen.covariance[0][0].sqrt(),
+            alignment,
+            calibration: self.shared.u_calibration_mm,
+            temperature,
+        };
+        Boundary {
+            flank,
+            point: point + correction,
+            d_mm: Quantified {
+                value: seen.offset_mm + correction.dot(n),
+                u: budget.u(),
+            },
+            budget,
+        }
+    }
+
     /// The place on flank `i` at the depth asked for: from the virtual edge into the face.
     fn at_depth(
         &self,
@@ -545,17 +595,36 @@ impl<B: Body> EdgeContext<'_, B> {
         stations: &mut [MeasuredStation],
     ) -> Vec<EdgeBreak> {
         let mut breaks = Vec::new();
+        for (range, stretch) in self.stretches(windows, series, zone, edges) {
+            if let Some(found) = edge_break::measure_stretch(&stretch) {
+                for station in &mut stations[range] {
+                    add_ridge(station, &found);
+                }
+                breaks.push(found.shape);
+            }
+        }
+        breaks
+    }
+
+    /// The stretches of an edge in which some station was measured, each with its stations.
+    pub(super) fn stretches<'s>(
+        &self,
+        windows: &Windows,
+        series: &'s [FlankSeries; 2],
+        zone: &'s [ZonePoint],
+        edges: &[Option<VirtualEdge>],
+    ) -> Vec<(Range<usize>, Stretch<'s>)> {
+        let wedge = |k: usize| match (&series[0].stations[k], &series[1].stations[k], edges[k]) {
+            (Ok(a), Ok(b), Some(edge)) => Some(Wedge {
+                s: windows.centre(k),
+                flanks: [a, b],
+                included_angle_rad: edge.included_angle_rad,
+            }),
+            _ => None,
+        };
+        let mut stretches = Vec::new();
         for first in (0..windows.count).step_by(STRETCH) {
             let range = first..(first + STRETCH).min(windows.count);
-            let wedge = |k: usize| match (&series[0].stations[k], &series[1].stations[k], edges[k])
-            {
-                (Ok(a), Ok(b), Some(edge)) => Some(Wedge {
-                    s: windows.centre(k),
-                    flanks: [a, b],
-                    included_angle_rad: edge.included_angle_rad,
-                }),
-                _ => None,
-            };
             let from = first as f64 * windows.step_mm;
             let to = range.end as f64 * windows.step_mm;
             let points = zone.partition_point(|p| p.s < from)..zone.partition_point(|p| p.s < to);
@@ -567,17 +636,11 @@ impl<B: Body> EdgeContext<'_, B> {
                 convex: self.edge.kind == EdgeKind::Convex,
                 shared_factor: [series[0].shared_factor, series[1].shared_factor],
             };
-            if stretch.wedges.is_empty() {
-                continue;
-            }
-            if let Some(found) = edge_break::measure_stretch(&stretch) {
-                for station in &mut stations[range] {
-                    add_ridge(station, &found);
-                }
-                breaks.push(found.shape);
+            if !stretch.wedges.is_empty() {
+                stretches.push((range, stretch));
             }
         }
-        breaks
+        stretches
     }
 
     fn mean(&self, sum: &MeanSum, series: &[FlankSeries; 2]) -> Option<EdgeMean> {
@@ -671,14 +734,21 @@ fn gap_text(gap: &FlankGap) -> String {
     }
 }
 
+/// Distance across the tangent from its two components along the normals, mm.
+pub(super) fn across(station: &Station, d: [f64; 2]) -> f64 {
+    let c = station.normals[0].dot(station.normals[1]);
+    let sine = (1.0 - c * c).max(1e-12);
+    ((d[0] * d[0] + d[1] * d[1] - 2.0 * c * d[0] * d[1]) / sine)
+        .max(0.0)
+        .sqrt()
+}
+
 /// Distance across the tangent from its two components along the normals, with first-order uncertainty; near zero, where the
 /// distance has no derivative, that of the worse component.
 fn total(station: &Station, d: [f64; 2], u: [f64; 2], covariance: f64) -> Quantified {
     let c = station.normals[0].dot(station.normals[1]);
     let sine = (1.0 - c * c).max(1e-12);
-    let value = ((d[0] * d[0] + d[1] * d[1] - 2.0 * c * d[0] * d[1]) / sine)
-        .max(0.0)
-        .sqrt();
+    let value = across(station, d);
     let worst = u[0].max(u[1]) / sine.sqrt();
     let by = [d[0] - c * d[1], d[1] - c * d[0]].map(|x| x / (sine * value.max(1e-12)));
     let variance = by[0].powi(2) * u[0].powi(2)

@@ -4,7 +4,10 @@
 //! calibration, the part's temperature and expansion - and runs the measurement on them: the flank fits, the exact intersection with the
 //! curved faces, the exact motion and growth. Trials are drawn in blocks until the results stand still.
 //!
-//! Source: JCGM 101:2008, 5.9 and 7.9 (adaptive procedure). We differ: which points a flank uses is kept from the measurement.
+//! Edge breaks are drawn as well, in a tenth of the trials: see [`super::edge_break`].
+//!
+//! Source: JCGM 101:2008, 5.9 and 7.9 (adaptive procedure). We differ: which points a flank uses is kept from the measurement, and the
+//! values stay those of the measurement: the trials give their uncertainty.
 
 use glam::{DQuat, DVec3};
 use nalgebra::{Matrix6, SymmetricEigen};
@@ -12,8 +15,10 @@ use rayon::prelude::*;
 
 use super::assign::{Place, Surface};
 use super::body::Body;
+use super::edge_break::draw_stretch;
 use super::flank::{Design, FlankFit};
-use super::measure::{EdgeContext, Flanks, MeasureSettings, with_flanks};
+use super::measure::{EdgeContext, Flanks, MeasureSettings, MeasuredEdge, across, with_flanks};
+use super::result::Measured;
 use crate::nominal::Station;
 use crate::points::PointCloud;
 
@@ -24,8 +29,10 @@ pub struct MonteCarlo {
     pub seed: u64,
     /// Trials of a block; JCGM 101 asks for at least 10,000.
     pub block: usize,
-    /// Blocks after which it ends, stable or not.
+    /// Blocks after which it ends, stable or not; not before where it is not `adaptive`.
     pub blocks_max: usize,
+    /// Whether it ends as soon as the values stand still.
+    pub adaptive: bool,
     /// Significant digits of the standard uncertainty that must stand (JCGM 101, 7.9.2): 1 or 2.
     pub digits: u32,
     /// Probability of the interval.
@@ -38,10 +45,42 @@ impl Default for MonteCarlo {
             seed: 1,
             block: 10_000,
             blocks_max: 20,
+            adaptive: true,
             digits: 2,
             probability: 0.95,
         }
     }
+}
+
+impl MonteCarlo {
+    /// As many trials as asked for, stable or not.
+    pub fn of_trials(trials: usize) -> Self {
+        let blocks_max = 10;
+        Self {
+            block: trials.div_ceil(blocks_max),
+            blocks_max,
+            adaptive: false,
+            ..Self::default()
+        }
+    }
+
+    /// Trials of an edge break: each fits a shape to a thousand points.
+    fn break_trials(&self) -> usize {
+        (self.block * self.blocks_max / 10).clamp(200, 2000)
+    }
+}
+
+/// What the trials of an inspection came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Trials {
+    /// Seed of all draws.
+    pub seed: u64,
+    /// Fewest and most trials of a station; 0 where none was measured.
+    pub stations: [usize; 2],
+    /// Stations whose values did not stand still to the digits asked for when the trials ended.
+    pub unstable: usize,
+    /// Most trials of an edge break.
+    pub breaks: usize,
 }
 
 /// A value as its trials show it, in the unit of the field that holds it.
@@ -62,6 +101,8 @@ pub struct DrawnStation {
     pub d_mm: [Drawn; 2],
     /// Included angle, rad.
     pub included_angle_rad: Drawn,
+    /// Distance across the tangent, mm.
+    pub total_mm: Drawn,
     /// Trials drawn.
     pub trials: usize,
     /// Whether the values stand still to the digits asked for.
@@ -88,6 +129,80 @@ pub fn measure_monte_carlo<B: Body>(
             })
             .collect()
     })
+}
+
+/// As [`super::measure::measure_edges_stepped`], with the uncertainties of d1, d2, the total, the included angle and the edge breaks from
+/// trials. `told` hears how many edges of how many are done.
+pub fn measure_edges_drawn<B: Body>(
+    cloud: &PointCloud,
+    places: &[Place],
+    surface: &Surface<'_, B>,
+    (settings, steps_mm): (&MeasureSettings, &[Option<f64>]),
+    how: &MonteCarlo,
+    told: &(dyn Fn(usize, usize) + Sync),
+) -> (Vec<MeasuredEdge>, Trials) {
+    let pose = root(&settings.pose_covariance);
+    let given = (settings, steps_mm);
+    with_flanks(cloud, places, surface, given, true, |flanks| {
+        let zones = flanks.zones();
+        let mut trials = Trials {
+            seed: how.seed,
+            stations: [usize::MAX, 0],
+            unstable: 0,
+            breaks: 0,
+        };
+        let count = flanks.series.len();
+        let mut edges = Vec::with_capacity(count);
+        for (e, zone) in zones.iter().enumerate() {
+            told(e, count);
+            let context = (flanks.context)(e);
+            let (windows, series) = (&flanks.windows[e], &flanks.series[e]);
+            let mut edge = context.combine(windows, series, zone);
+            let drawn: Vec<Option<DrawnStation>> = (0..windows.count)
+                .into_par_iter()
+                .map(|k| station(flanks, settings, &pose, how, (e, k)))
+                .collect();
+            for (station, drawn) in edge.stations.iter_mut().zip(drawn) {
+                if let (Ok(measured), Some(drawn)) = (&mut station.outcome, drawn) {
+                    take_over(measured, &drawn);
+                    trials.stations[0] = trials.stations[0].min(drawn.trials);
+                    trials.stations[1] = trials.stations[1].max(drawn.trials);
+                    trials.unstable += usize::from(!drawn.stable);
+                }
+            }
+            let virtual_edges = context.virtual_edges(windows, series);
+            let stretches = context.stretches(windows, series, zone, &virtual_edges);
+            let breaks: Vec<_> = stretches
+                .par_iter()
+                .map(|(range, stretch)| {
+                    let place = ((e as u64) << 32) ^ range.start as u64 ^ (1 << 63);
+                    draw_stretch(stretch, own_seed(how.seed, place), how.break_trials())
+                })
+                .collect();
+            for (shape, drawn) in edge.breaks.iter_mut().zip(breaks.into_iter().flatten()) {
+                *shape = drawn.shape;
+                trials.breaks = trials.breaks.max(drawn.trials);
+            }
+            edges.push(edge);
+        }
+        told(count, count);
+        trials.stations[0] = trials.stations[0].min(trials.stations[1]);
+        (edges, trials)
+    })
+}
+
+/// The standard uncertainties of a station by its trials. That of the total is about its value: near zero, where a distance cannot fall
+/// below, the trials lie on one side of it.
+fn take_over(measured: &mut Measured, drawn: &DrawnStation) {
+    measured.u_d_mm = drawn.d_mm.map(|d| d.u);
+    measured.u_included_angle_rad = drawn.included_angle_rad.u;
+    let bias = drawn.total_mm.mean - measured.total_mm.value;
+    measured.total_mm.u = drawn.total_mm.u.hypot(bias);
+}
+
+/// The seed of a place's own draws.
+fn own_seed(seed: u64, place: u64) -> u64 {
+    seed ^ place.wrapping_add(1).wrapping_mul(0x9FB2_1C65_1E98_DF25)
 }
 
 /// The symmetric square root of a covariance.
@@ -120,20 +235,17 @@ fn station<B: Body>(
         pose,
     };
     model.trial(&mut Inputs::none())?;
-    let mut trials: [Vec<f64>; 3] = Default::default();
-    let mut blocks: Vec<[Drawn; 3]> = Vec::new();
+    let mut trials: [Vec<f64>; 4] = Default::default();
+    let mut blocks: Vec<[Drawn; 4]> = Vec::new();
     let mut stable = false;
     let size = how.block.clamp(100, 1_000_000);
-    while blocks.len() < how.blocks_max.clamp(2, 1000) && !stable {
+    while blocks.len() < how.blocks_max.clamp(2, 1000) && !(stable && how.adaptive) {
         let from = blocks.len() * size;
         for t in from..from + size {
             let place = ((e as u64) << 32) ^ k as u64;
             let mut inputs = Inputs {
                 shared: Some(Draws::new(how.seed, t as u64)),
-                own: Some(Draws::new(
-                    how.seed ^ place.wrapping_add(1).wrapping_mul(0x9FB2_1C65_1E98_DF25),
-                    t as u64,
-                )),
+                own: Some(Draws::new(own_seed(how.seed, place), t as u64)),
             };
             // Flanks that a draw makes parallel have no edge; one that was measured is far from it.
             if let Some(values) = model.trial(&mut inputs) {
@@ -143,13 +255,14 @@ fn station<B: Body>(
             }
         }
         let of = |list: &Vec<f64>| summary(&list[from.min(list.len())..], how.probability);
-        blocks.push([of(&trials[0]), of(&trials[1]), of(&trials[2])]);
+        blocks.push(trials.each_ref().map(of));
         stable = stands_still(&blocks, how.digits);
     }
     let all = trials.each_ref().map(|list| summary(list, how.probability));
     Some(DrawnStation {
         d_mm: [all[0], all[1]],
         included_angle_rad: all[2],
+        total_mm: all[3],
         trials: trials[0].len(),
         stable,
     })
@@ -177,12 +290,12 @@ fn summary(values: &[f64], probability: f64) -> Drawn {
 }
 
 /// JCGM 101, 7.9.4: twice the standard deviation of the mean of every result over the blocks is below half a unit of the last digit.
-fn stands_still(blocks: &[[Drawn; 3]], digits: u32) -> bool {
+fn stands_still(blocks: &[[Drawn; 4]], digits: u32) -> bool {
     let h = blocks.len() as f64;
     if h < 2.0 {
         return false;
     }
-    (0..3).all(|v| {
+    (0..4).all(|v| {
         let of = |pick: fn(&Drawn) -> f64| {
             let mean = blocks.iter().map(|b| pick(&b[v])).sum::<f64>() / h;
             let square = blocks
@@ -236,8 +349,8 @@ impl Inputs {
 }
 
 impl<B: Body> Model<'_, B> {
-    /// d1, d2 and the included angle.
-    fn trial(&self, inputs: &mut Inputs) -> Option<[f64; 3]> {
+    /// d1, d2, the included angle and the total.
+    fn trial(&self, inputs: &mut Inputs) -> Option<[f64; 4]> {
         let drawn: [FlankFit; 2] = std::array::from_fn(|i| {
             let [offset, tilt] = inputs
                 .own
@@ -269,7 +382,7 @@ impl<B: Body> Model<'_, B> {
                 + self.settings.u_calibration_mm * inputs.shared()
         });
         let angle = edge.included_angle_rad + self.settings.u_calibration_rad * inputs.shared();
-        Some([d[0], d[1], angle])
+        Some([d[0], d[1], angle, across(&self.station, d)])
     }
 }
 
@@ -291,13 +404,13 @@ fn redraw(design: &Design, draws: &mut Draws) -> [f64; 2] {
 }
 
 /// Normal numbers from a counter: SplitMix64 and the polar form of Box and Muller.
-struct Draws {
+pub(super) struct Draws {
     state: u64,
     spare: Option<f64>,
 }
 
 impl Draws {
-    fn new(seed: u64, trial: u64) -> Self {
+    pub(super) fn new(seed: u64, trial: u64) -> Self {
         let mut draws = Self {
             state: seed ^ trial.wrapping_mul(0xD6E8_FEB8_6659_FD93),
             spare: None,
@@ -315,7 +428,7 @@ impl Draws {
         z ^ (z >> 31)
     }
 
-    fn normal(&mut self) -> f64 {
+    pub(super) fn normal(&mut self) -> f64 {
         if let Some(spare) = self.spare.take() {
             return spare;
         }

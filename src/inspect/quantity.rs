@@ -202,20 +202,47 @@ impl Quantity {
     }
 }
 
+/// Where a limit comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum LimitSource {
+    /// The recipe.
+    Recipe,
+    /// The entity with this number in the nominal's PMI.
+    Pmi(u64),
+}
+
 /// Lower and upper limit of every quantity, in mm and rad; `None` = not evaluated, an infinite one = no limit on that side.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Limits([Option<[f64; 2]>; Quantity::COUNT]);
+pub struct Limits([Option<([f64; 2], LimitSource)>; Quantity::COUNT]);
 
 impl Limits {
     /// Of one quantity.
     pub fn of(&self, quantity: Quantity) -> Option<[f64; 2]> {
-        self.0[quantity as usize]
+        self.0[quantity as usize].map(|(limits, _)| limits)
     }
 
-    /// These with `limits` for one quantity.
+    /// Where those of one quantity come from.
+    pub fn source(&self, quantity: Quantity) -> Option<LimitSource> {
+        self.0[quantity as usize].map(|(_, source)| source)
+    }
+
+    /// These with `limits` of the recipe for one quantity.
     #[must_use]
     pub fn with(mut self, quantity: Quantity, limits: [f64; 2]) -> Self {
-        self.0[quantity as usize] = Some(limits);
+        self.0[quantity as usize] = Some((limits, LimitSource::Recipe));
+        self
+    }
+
+    /// These with `limits` from the PMI entity `entity` for one quantity, where they leave less room than what is there.
+    #[must_use]
+    pub fn tightened(mut self, quantity: Quantity, limits: [f64; 2], entity: u64) -> Self {
+        let width = |limits: [f64; 2]| limits[1] - limits[0];
+        let tighter = self
+            .of(quantity)
+            .is_none_or(|own| width(limits) < width(own) || limits[1] < own[1]);
+        if tighter {
+            self.0[quantity as usize] = Some((limits, LimitSource::Pmi(entity)));
+        }
         self
     }
 

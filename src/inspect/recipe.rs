@@ -2,7 +2,8 @@
 //!
 //! ```toml
 //! rule = { guard_band = 2.0 }       # or "simple", the default, or { conformance = 0.95 }, in the manner of ISO 14253-1
-//! datum_faces = [17, 45, 61]        # STEP entities; without them all faces hold the alignment
+//! datum_faces = [17, 45, 61]        # STEP entities; the faces of the best fit, without them all
+//! limits_from_pmi = true            # tolerances in the nominal's PMI count before [limits] and after [[edge]]; the default is false
 //! minimum_coverage = 0.9            # an edge measured over less is not decidable
 //! missing_edges = "not_ok"          # of edges with limits, the default; or "report"
 //! unexpected_edges = "report"       # the default; or "not_ok"
@@ -13,6 +14,22 @@
 //! direction_mm = 5.0                # length over which a direction is taken; without it five stations
 //! u_calibration_mm = 0.002          # standard uncertainty of a flank's place from the sensor's calibration
 //! u_calibration_rad = 0.0           # and of the included angle
+//!
+//! [[alignment.datum]]               # features that the pose rests on; without them the best fit stands
+//! name = "A"                        # optional
+//! faces = [17]                      # STEP entities: one plane, cylinder, cone or sphere
+//! priority = 1                      # the default; 1 holds first, 2 and 3 what it leaves free
+//!
+//! [[alignment.datum]]               # a reference point (RPS)
+//! name = "B1"
+//! point_mm = [10.0, 0.0, 5.0]       # on the nominal, in the part frame
+//! direction = [0.0, -1.0, 0.0]      # what it holds; without it the normal of the face there
+//! radius_mm = 1.5                   # of the patch that is measured; without it some fifty points
+//! priority = 2
+//!
+//! [[alignment.datum]]
+//! pmi = "C"                         # the datum feature with this letter in the nominal's PMI
+//! priority = 3
 //!
 //! [environment]
 //! temperature_c = [18.0, 22.0]      # outside of it, or where nobody says the temperature, nothing is decided
@@ -66,14 +83,18 @@ pub struct Recipe {
     pub rule: Rule,
     /// Limits of every edge for which `edges` says nothing else.
     pub limits: Limits,
+    /// Whether tolerances in the nominal's PMI count as limits, before those of every edge and after those of `edges`.
+    pub limits_from_pmi: bool,
     /// Largest distance of a corner from its nominal place, mm; `None` = not evaluated.
     pub corner_mm: Option<f64>,
     /// Edges with a name, limits or a step of their own, or out of judgement. Later entries count over earlier ones.
     pub edges: Vec<EdgeRecipe>,
     /// Gaps between edges.
     pub gaps: Vec<GapRecipe>,
-    /// STEP entities of the faces that hold the alignment; empty = all faces.
+    /// STEP entities of the faces of the best fit; empty = all faces.
     pub datum_faces: Vec<u64>,
+    /// Features that the pose rests on; empty = the best fit stands.
+    pub datums: Vec<DatumRecipe>,
     /// Share of an edge's length that must be measured for the edge to be decidable, 0 to 1.
     pub minimum_coverage: f64,
     /// Whether a missing edge that has limits makes the part not OK.
@@ -117,10 +138,12 @@ impl Default for Recipe {
             sha256: String::new(),
             rule: Rule::Simple,
             limits: Limits::default(),
+            limits_from_pmi: false,
             corner_mm: None,
             edges: Vec::new(),
             gaps: Vec::new(),
             datum_faces: Vec::new(),
+            datums: Vec::new(),
             minimum_coverage: 0.9,
             missing_edges_count: true,
             unexpected_edges_count: false,
@@ -250,6 +273,35 @@ pub enum EdgeKey {
     Id(String),
 }
 
+/// A feature that the pose rests on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DatumRecipe {
+    /// The name in the report.
+    pub name: String,
+    /// 1 holds before 2, 2 before 3.
+    pub priority: u32,
+    /// Where it is.
+    pub source: DatumSource,
+}
+
+/// Where a datum feature is found.
+#[derive(Debug, Clone, PartialEq)]
+pub enum DatumSource {
+    /// STEP entities of faces that are one plane, axis or sphere.
+    Faces(Vec<u64>),
+    /// A reference point on the nominal.
+    Point {
+        /// Its place, mm, part frame.
+        nominal: DVec3,
+        /// What it holds; `None` = along the normal of the face.
+        direction: Option<DVec3>,
+        /// Radius of the patch that is measured, mm; `None` = from the spacing.
+        radius_mm: Option<f64>,
+    },
+    /// The datum feature with this letter in the nominal's PMI.
+    Pmi(String),
+}
+
 /// Gap and flush between two edges.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GapRecipe {
@@ -264,8 +316,13 @@ pub struct GapRecipe {
 }
 
 impl Recipe {
-    /// All that holds for `edge`.
+    /// All that this says of `edge`.
     pub fn of(&self, edge: &EdgeFacts) -> Resolved {
+        self.of_edge(edge, Limits::default())
+    }
+
+    /// All that holds for `edge`: what entries say of it, then the limits that come with the nominal, then those of every edge.
+    pub fn of_edge(&self, edge: &EdgeFacts, by_nominal: Limits) -> Resolved {
         let mut limits = Limits::default();
         let (mut name, mut judged, mut step) = (None, true, self.station_step_mm);
         for entry in self.edges.iter().filter(|entry| entry.select.means(edge)) {
@@ -277,7 +334,7 @@ impl Recipe {
         Resolved {
             name,
             limits: if judged {
-                limits.or(self.limits)
+                limits.or(by_nominal).or(self.limits)
             } else {
                 Limits::default()
             },
@@ -400,7 +457,7 @@ mod tests {
         for expected in [
             "rule: \"strict\", expected \"simple\", { guard_band = k }",
             "minimum_coverage: 2, expected a number of 0 to 1",
-            "colour: an unknown key, expected one of limits, environment, expansion, rule, edge",
+            "colour: an unknown key, expected one of limits, environment, alignment, expansion, rule, limits_from_pmi, edge",
             "datum_faces: [\"a\"], expected numbers of STEP entities",
             "limits.d_mm: [0.1, -0.1], expected two numbers, the lower limit then the upper",
             "limits.width: an unknown key, expected one of d_mm",

@@ -3,6 +3,7 @@
 use glam::DVec3;
 
 use super::flank::FlankModel;
+use super::monte_carlo::Trials;
 use crate::features::Class;
 use crate::geometry::RigidTransform;
 use crate::nominal::{EdgeKind, Station};
@@ -40,6 +41,8 @@ pub struct Inspection {
     pub missing_edges: Vec<String>,
     /// Worst of the edges and of the alignment.
     pub verdict: Verdict,
+    /// The trials of the Monte Carlo method; `None` where uncertainties are of first order.
+    pub trials: Option<Trials>,
     /// Seconds by stage, in order.
     pub seconds: Vec<(&'static str, f64)>,
     /// What was wrong with the data; the result goes on.
@@ -74,6 +77,79 @@ pub struct Alignment {
     pub weak_directions: Vec<String>,
     /// Ok, or NotDecidable with the reason in the findings.
     pub status: Verdict,
+    /// How the pose was found.
+    pub method: Method,
+    /// STEP entities of the faces that the best fit used; empty = all.
+    pub faces: Vec<u64>,
+    /// The datum features that the pose rests on.
+    pub datums: Vec<DatumResult>,
+    /// What they leave free, in words: there the pose is that of the best fit.
+    pub free_of_datums: Vec<String>,
+}
+
+impl Default for Alignment {
+    /// The identity, of which nothing is known.
+    fn default() -> Self {
+        Self {
+            part_from_machine: RigidTransform::IDENTITY,
+            rms_mm: 0.0,
+            points: 0,
+            covariance: [[0.0; 6]; 6],
+            weak_directions: Vec::new(),
+            status: Verdict::Undefined,
+            method: Method::BestFit,
+            faces: Vec::new(),
+            datums: Vec::new(),
+            free_of_datums: Vec::new(),
+        }
+    }
+}
+
+/// How a pose was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Method {
+    /// The scan was taken as it lies.
+    AsGiven,
+    /// Least squares over the faces.
+    BestFit,
+    /// On datum features.
+    Datums,
+}
+
+/// A datum feature as measured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct DatumResult {
+    /// The recipe's name.
+    pub name: String,
+    /// What it holds.
+    pub kind: DatumKind,
+    /// 1 holds before 2, 2 before 3.
+    pub priority: u32,
+    /// STEP entities of its faces; empty for a reference point.
+    pub faces: Vec<u64>,
+    /// Points used.
+    pub points: usize,
+    /// How far it lies off its nominal at the pose: the place, mm.
+    pub residual_mm: f64,
+    /// And its direction, rad, where it has one.
+    pub residual_rad: Option<f64>,
+    /// Standard uncertainty of its place, mm.
+    pub u_mm: f64,
+    /// Standard deviation of its points about it, mm: noise and form.
+    pub form_mm: f64,
+}
+
+/// What a datum feature holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DatumKind {
+    /// A reference point: one direction.
+    Point,
+    /// A plane.
+    Plane,
+    /// The axis of a cylinder or cone.
+    Axis,
+    /// The centre of a sphere.
+    Centre,
 }
 
 /// One nominal edge as measured.
@@ -89,6 +165,8 @@ pub struct EdgeResult {
     pub length_mm: f64,
     /// Share of the length that was measured, 0 to 1.
     pub coverage: f64,
+    /// Share of the length of which only one flank was seen, 0 to 1.
+    pub boundary_share: f64,
     /// In order of arc length.
     pub stations: Vec<StationResult>,
     /// The shape of the edge itself, one a stretch of stations, in order of arc length; empty where it was not seen.
@@ -191,12 +269,27 @@ pub struct StationResult {
     pub station: Station,
     /// What was measured there.
     pub measured: Option<Measured>,
+    /// The one flank that was seen, where only one was.
+    pub boundary: Option<Boundary>,
     /// Points used on each flank.
     pub points: [usize; 2],
     /// Verdict of the station.
     pub verdict: Verdict,
     /// Why it was not measured or not decidable; empty otherwise.
     pub reason: String,
+}
+
+/// A station of which only one flank was seen: the edge is a boundary of the scan, and only its offset along that flank's normal is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Boundary {
+    /// The flank that was seen: 0 or 1.
+    pub flank: usize,
+    /// The measured face at the nominal edge, mm, part frame.
+    pub point: DVec3,
+    /// Its deviation along the normal of the face, mm; plus = material outside the nominal.
+    pub d_mm: Quantified,
+    /// What its uncertainty is made of.
+    pub budget: Budget,
 }
 
 /// The virtual edge at a station and its deviations. Sign: plus = material outside the nominal.
@@ -325,6 +418,13 @@ pub enum BreakShape {
         legs_mm: [Quantified; 2],
         /// Angle of the chamfer's plane to flank 1, rad.
         angle_rad: Quantified,
+    },
+    /// Broken, but the data do not tell a cylinder from a plane.
+    Undecided {
+        /// The radius if it is a cylinder, mm.
+        radius_mm: Quantified,
+        /// The legs if it is a plane, mm.
+        legs_mm: [Quantified; 2],
     },
     /// Neither: a burr, an undercut, damage.
     Irregular,

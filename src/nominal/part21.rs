@@ -262,6 +262,27 @@ impl<'a> Record<'a> {
             .collect()
     }
 
+    /// Numbers of the entities at position `i`: one, a list of them, or a typed list of them.
+    pub fn items(&self, i: usize) -> Vec<u64> {
+        let list = |items: &[Attribute]| -> Vec<u64> {
+            let id = |a: &Attribute| match a {
+                Attribute::EntityRef(id) => Some(*id),
+                _ => None,
+            };
+            items.iter().filter_map(id).collect()
+        };
+        match self.attribute(i) {
+            Ok(Attribute::EntityRef(id)) => vec![*id],
+            Ok(Attribute::List(items)) => list(items),
+            Ok(Attribute::Typed { value, .. }) => match &**value {
+                Attribute::EntityRef(id) => vec![*id],
+                Attribute::List(items) => list(items),
+                _ => Vec::new(),
+            },
+            _ => Vec::new(),
+        }
+    }
+
     /// Rows of numbers of entities.
     pub fn reference_rows(&self, i: usize) -> Read<Vec<Vec<u64>>> {
         self.rows(i, |a| match a {

@@ -22,6 +22,8 @@ pub struct Pmi {
     pub kind: PmiKind,
     /// Numbers of the ADVANCED_FACEs that it applies to, ascending.
     pub faces: Vec<u64>,
+    /// Numbers of the EDGE_CURVEs that it applies to, ascending.
+    pub edges: Vec<u64>,
 }
 
 /// What a piece of PMI says.
@@ -44,6 +46,8 @@ pub enum PmiKind {
         zone_mm: f64,
         /// Letters of its datums, in order.
         datums: Vec<String>,
+        /// Whether its zone lies unevenly about the nominal.
+        unequal: bool,
     },
     /// A feature that establishes a datum.
     DatumFeature {
@@ -214,6 +218,7 @@ fn dimension(
             measure(file, upper).ok()?.value(),
         ])
     });
+    let (faces, edges) = aspects.faces_and_edges(&applies);
     Ok(Pmi {
         entity: id,
         name: String::new(),
@@ -222,7 +227,8 @@ fn dimension(
             value,
             deviations: given.or(stated),
         },
-        faces: aspects.faces(&applies),
+        faces,
+        edges,
     })
 }
 
@@ -243,6 +249,7 @@ fn tolerance(aspects: &mut Aspects<'_>, id: u64) -> Read<Pmi> {
     for system in with_datums.unwrap_or_default() {
         datums.extend(datum_letters(file, system, 0));
     }
+    let (faces, edges) = aspects.faces_and_edges(&[r.reference(3)?]);
     Ok(Pmi {
         entity: id,
         name: r.text(0),
@@ -250,8 +257,10 @@ fn tolerance(aspects: &mut Aspects<'_>, id: u64) -> Read<Pmi> {
             what: tolerance_kind(file, id).unwrap_or_default(),
             zone_mm,
             datums,
+            unequal: file.is(id, "UNEQUALLY_DISPOSED_GEOMETRIC_TOLERANCE"),
         },
-        faces: aspects.faces(&[r.reference(3)?]),
+        faces,
+        edges,
     })
 }
 
@@ -290,13 +299,15 @@ fn datum_feature(aspects: &mut Aspects<'_>, feature: u64, datum: u64) -> Read<Pm
         Some(part) => part.text(0),
         None => file.record(feature)?.text(0),
     };
+    let (faces, edges) = aspects.faces_and_edges(&[feature]);
     Ok(Pmi {
         entity: feature,
         name,
         kind: PmiKind::DatumFeature {
             letter: file.record(datum)?.text(4),
         },
-        faces: aspects.faces(&[feature]),
+        faces,
+        edges,
     })
 }
 
@@ -322,14 +333,13 @@ fn measure(file: &Part21, id: u64) -> Read<Measure> {
 impl<'a> Aspects<'a> {
     fn new(file: &'a Part21) -> Self {
         let mut items: BTreeMap<u64, Vec<u64>> = BTreeMap::new();
-        for id in file.all(&["GEOMETRIC_ITEM_SPECIFIC_USAGE"]) {
-            let read = |r: Record<'_>| -> Read<(u64, Vec<u64>)> {
-                let used = r
-                    .reference(4)
-                    .map(|i| vec![i])
-                    .or_else(|_| r.references(4))?;
-                Ok((r.reference(2)?, used))
-            };
+        // The first names one item, the second a set of them: a datum on both halves of a hole.
+        for id in file.all(&[
+            "GEOMETRIC_ITEM_SPECIFIC_USAGE",
+            "ITEM_IDENTIFIED_REPRESENTATION_USAGE",
+        ]) {
+            let read =
+                |r: Record<'_>| -> Read<(u64, Vec<u64>)> { Ok((r.reference(2)?, r.items(4))) };
             if let Ok((aspect, used)) = file.record(id).and_then(read) {
                 items.entry(aspect).or_default().extend(used);
             }
@@ -348,15 +358,21 @@ impl<'a> Aspects<'a> {
         }
     }
 
-    /// The faces of some aspects and of those that they gather.
-    fn faces(&mut self, of: &[u64]) -> Vec<u64> {
+    /// The faces and edges of some aspects and of those that they gather.
+    fn faces_and_edges(&mut self, of: &[u64]) -> (Vec<u64>, Vec<u64>) {
         let mut seen: BTreeSet<u64> = of.iter().copied().collect();
         let mut open: Vec<u64> = of.to_vec();
-        let mut faces = BTreeSet::new();
+        let (mut faces, mut edges) = (BTreeSet::new(), BTreeSet::new());
         while let Some(aspect) = open.pop() {
-            let items = self.items.get(&aspect).into_iter().flatten();
-            for item in items.filter(|i| self.file.is(**i, "ADVANCED_FACE")) {
-                if self.left > 0 && faces.insert(*item) {
+            for item in self.items.get(&aspect).into_iter().flatten() {
+                let list = if self.file.is(*item, "ADVANCED_FACE") {
+                    &mut faces
+                } else if self.file.is(*item, "EDGE_CURVE") {
+                    &mut edges
+                } else {
+                    continue;
+                };
+                if self.left > 0 && list.insert(*item) {
                     self.left -= 1;
                 }
             }
@@ -366,6 +382,6 @@ impl<'a> Aspects<'a> {
                 }
             }
         }
-        faces.into_iter().collect()
+        (faces.into_iter().collect(), edges.into_iter().collect())
     }
 }

@@ -6,8 +6,8 @@
 
 use crate::geometry::newton::Range;
 
-/// Segments up to which each vertex gets a strip of its own.
-const MAX_EXACT: usize = 4000;
+/// Segments up to which each vertex gets a strip of its own: plates with a hundred holes have twenty thousand.
+const MAX_EXACT: usize = 200_000;
 
 /// A loop as a polyline of parameters, unwrapped: it may run on beyond the range of a closed direction.
 pub(super) type UvLoop = Vec<(f64, f64)>;

@@ -10,10 +10,11 @@ use super::characteristic::{on_the_wire, spread};
 use super::conclusion;
 use super::wire::{self, Quantity, Report, Status};
 use crate::inspect::flank::FlankModel;
+use crate::inspect::monte_carlo::Trials;
 use crate::inspect::recipe::{Recipe, Rule};
 use crate::inspect::result::{
-    Alignment, BreakShape, Budget, CornerResult, EdgeBreak, EdgeForm, EdgeResult, GapResult,
-    Inspection, Measured, Quantified, StationResult, Verdict,
+    Alignment, BreakShape, Budget, CornerResult, DatumKind, DatumResult, EdgeBreak, EdgeForm,
+    EdgeResult, GapResult, Inspection, Measured, Method, Quantified, StationResult, Verdict,
 };
 use crate::nominal::EdgeKind;
 
@@ -58,6 +59,7 @@ impl Report {
             scan: scan_from_facts(facts),
             devices: devices_from_facts(facts),
             alignment,
+            uncertainty: uncertainty_from_trials(inspection.trials),
             edges,
             corners: inspection
                 .corners
@@ -139,6 +141,7 @@ fn recipe_on_the_wire(recipe: &Recipe) -> wire::Recipe {
             d2_mm: limits(Quantity::D2),
             angle_deviation_deg: limits(Quantity::AngleDeviation),
         },
+        limits_from_pmi: recipe.limits_from_pmi,
         minimum_coverage: finite(recipe.minimum_coverage),
         u_calibration_mm: finite(recipe.u_calibration_mm),
         u_calibration_deg: degrees(recipe.u_calibration_rad),
@@ -215,6 +218,46 @@ fn alignment_from_result(alignment: &Alignment) -> wire::Alignment {
             .then_some(covariance),
         weak_directions: alignment.weak_directions.clone(),
         status,
+        method: match alignment.method {
+            Method::AsGiven => wire::AlignmentMethod::AsGiven,
+            Method::BestFit => wire::AlignmentMethod::BestFit,
+            Method::Datums => wire::AlignmentMethod::Datums,
+        },
+        faces: alignment.faces.clone(),
+        datums: alignment.datums.iter().map(datum_from_result).collect(),
+        free_of_datums: alignment.free_of_datums.clone(),
+    }
+}
+
+fn uncertainty_from_trials(trials: Option<Trials>) -> wire::Uncertainty {
+    wire::Uncertainty {
+        method: match trials {
+            Some(_) => wire::UncertaintyMethod::MonteCarlo,
+            None => wire::UncertaintyMethod::FirstOrder,
+        },
+        trials: trials.map(|t| t.stations),
+        break_trials: trials.map(|t| t.breaks),
+        seed: trials.map(|t| t.seed),
+        unstable_stations: trials.map(|t| t.unstable),
+    }
+}
+
+fn datum_from_result(found: &DatumResult) -> wire::Datum {
+    wire::Datum {
+        name: found.name.clone(),
+        kind: match found.kind {
+            DatumKind::Point => wire::DatumKind::Point,
+            DatumKind::Plane => wire::DatumKind::Plane,
+            DatumKind::Axis => wire::DatumKind::Axis,
+            DatumKind::Centre => wire::DatumKind::Centre,
+        },
+        priority: found.priority,
+        faces: found.faces.clone(),
+        points: found.points,
+        residual_mm: finite(found.residual_mm),
+        residual_deg: found.residual_rad.and_then(degrees),
+        u_mm: finite(found.u_mm),
+        form_mm: finite(found.form_mm),
     }
 }
 
@@ -253,6 +296,7 @@ fn edge_from_result(edge: &EdgeResult, facts: &Facts, findings: &mut Vec<String>
         },
         length_mm: finite(edge.length_mm),
         coverage: finite(edge.coverage).unwrap_or(summary.measured_share),
+        boundary_share: finite(edge.boundary_share),
         stations,
         breaks: edge.breaks.iter().filter_map(break_from_result).collect(),
         form: edge.form.as_ref().map(form_from_result),
@@ -282,6 +326,9 @@ fn summary(edge: &EdgeResult, stations: &[wire::Station]) -> wire::Summary {
 fn worst_budget(edge: &EdgeResult, quantity: Quantity, s_mm: Option<f64>) -> Option<Budget> {
     let mut stations = edge.stations.iter();
     let station = stations.find(|station| Some(station.station.s_mm) == s_mm)?;
+    if let Some(boundary) = &station.boundary {
+        return Some(boundary.budget);
+    }
     let measured = station.measured.as_ref()?;
     match quantity {
         Quantity::D1 => Some(measured.budget_d[0]),
@@ -333,6 +380,11 @@ fn break_from_result(found: &EdgeBreak) -> Option<wire::Break> {
             stretch.shape = wire::Shape::Chamfer;
             stretch.chamfer_legs_mm = Some(legs_mm.map(value));
             stretch.chamfer_angle_deg = Some(value_in_degrees(angle_rad));
+        }
+        BreakShape::Undecided { radius_mm, legs_mm } => {
+            stretch.shape = wire::Shape::Undecided;
+            stretch.radius_mm = Some(value(radius_mm));
+            stretch.chamfer_legs_mm = Some(legs_mm.map(value));
         }
         BreakShape::Irregular => {}
     }
@@ -420,6 +472,14 @@ fn station_from_result(
         included_angle_deg: None,
         u_included_angle_deg: None,
         total_mm: None,
+        boundary: result.boundary.as_ref().and_then(|found| {
+            Some(wire::Boundary {
+                flank: found.flank + 1,
+                point: xyz(found.point)?,
+                d_mm: value(found.d_mm),
+                budget: with_budget.then(|| budget_on_the_wire(found.budget, 1.0)),
+            })
+        }),
         flank_models: None,
         ridge: None,
         at_depth: [None; 2],
@@ -441,12 +501,16 @@ fn station_from_result(
 fn budgets(measured: &Measured) -> [wire::Budget; 3] {
     let [d1, d2] = measured.budget_d;
     let each = [(d1, 1.0), (d2, 1.0), (measured.budget_angle, 180.0 / PI)];
-    each.map(|(budget, scale)| wire::Budget {
+    each.map(|(budget, scale)| budget_on_the_wire(budget, scale))
+}
+
+fn budget_on_the_wire(budget: Budget, scale: f64) -> wire::Budget {
+    wire::Budget {
         points: finite(scale * budget.points),
         alignment: finite(scale * budget.alignment),
         calibration: finite(scale * budget.calibration),
         temperature: finite(scale * budget.temperature),
-    })
+    }
 }
 
 /// Takes over what is finite; says what was not.

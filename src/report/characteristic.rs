@@ -3,7 +3,7 @@
 use super::build::{finite, status_from_verdict};
 use super::wire::{self, Spread, Station};
 use crate::inspect::characteristic::Characteristic;
-use crate::inspect::quantity::Quantity;
+use crate::inspect::quantity::{LimitSource, Quantity};
 use crate::inspect::recipe::Rule;
 use crate::inspect::result::Budget;
 use crate::inspect::verdict::conformance;
@@ -19,7 +19,13 @@ pub struct Sample {
 
 /// `quantity` at one station; `None` where it was not measured, or belongs to no station.
 pub fn sample(station: &Station, quantity: Quantity) -> Option<Sample> {
+    let of_boundary = |flank: usize| {
+        let seen = station.boundary.filter(|seen| seen.flank == flank);
+        seen.map_or((None, None), |seen| (seen.d_mm.value, seen.d_mm.u))
+    };
     let (value, u) = match quantity {
+        Quantity::D1 if station.boundary.is_some() => of_boundary(1),
+        Quantity::D2 if station.boundary.is_some() => of_boundary(2),
         Quantity::D1 => (station.d1_mm, station.u_d1_mm),
         Quantity::D2 => (station.d2_mm, station.u_d2_mm),
         Quantity::AngleDeviation => (
@@ -62,6 +68,10 @@ pub fn on_the_wire(
         s_mm: found.s_mm.and_then(finite),
         lower: limit(0),
         upper: limit(1),
+        limits_from: found.limits_from.map(|source| match source {
+            LimitSource::Recipe => "recipe".to_owned(),
+            LimitSource::Pmi(entity) => format!("#{entity}"),
+        }),
         conformance: probability.filter(|_| rule != Rule::Simple),
         verdict: status_from_verdict(found.verdict),
         reason: found.reason.clone(),

@@ -2,7 +2,7 @@
 
 use super::wire::{Edge, Kind, Report, Station, Status};
 
-const HEADER: [&str; 34] = [
+const HEADER: [&str; 37] = [
     "edge",
     "step_entity",
     "kind",
@@ -37,6 +37,9 @@ const HEADER: [&str; 34] = [
     "edge_verdict",
     "part_verdict",
     "reason",
+    "boundary_flank",
+    "boundary_d_mm",
+    "u_boundary_d_mm",
 ];
 
 impl Report {
@@ -111,6 +114,11 @@ fn row(edge: &Edge, station: &Station, part: Status) -> [String; HEADER.len()] {
         word(edge.verdict),
         word(part),
         text(&station.reason),
+        station
+            .boundary
+            .map_or_else(String::new, |seen| seen.flank.to_string()),
+        length(station.boundary.and_then(|seen| seen.d_mm.value)),
+        length(station.boundary.and_then(|seen| seen.d_mm.u)),
     ]
 }
 

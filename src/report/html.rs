@@ -299,19 +299,28 @@ fn write_view(out: &mut String, drawing: &Drawing<'_>) -> fmt::Result {
     out.write_str("</ul></section>\n")
 }
 
+/// `, 40 % boundary (one flank seen)`; nothing where both were seen.
+fn boundary(edge: &Edge) -> String {
+    match edge.boundary_share {
+        Some(share) if share > 0.0 => format!(", {} boundary (one flank seen)", percent(share)),
+        _ => String::new(),
+    }
+}
+
 fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::Result {
     out.write_str("<section class=\"card\"><h2>Each edge</h2>\n<p class=\"small soft\">Line: deviation. Band around it: ± U. \
          Tinted stripe: within the limits; dashed lines: the limits, value at the right. Hatched: not measured. Diamond: the worst place.</p>\n")?;
     for (index, (edge, shown)) in report.edges.iter().zip(shown).enumerate() {
         writeln!(
             out,
-            "<section class=\"edge\" id=\"edge-{index}\"><h3>{} {} <span class=\"soft small\">{}, {} mm, {} measured, STEP #{}</span></h3>",
+            "<section class=\"edge\" id=\"edge-{index}\"><h3>{} {} <span class=\"soft small\">{}, {} mm, {} measured{}, STEP #{}</span></h3>",
             Escaped(&edge.id),
             State(edge.verdict),
             kind(edge),
             edge.length_mm
                 .map_or_else(|| "–".to_owned(), |length| format!("{length:.1}")),
             percent(edge.coverage),
+            boundary(edge),
             edge.nominal_entity
         )?;
         write_reasons(out, edge)?;

@@ -44,6 +44,8 @@ pub struct Report {
     pub devices: Vec<Device>,
     /// How the scan lies in the part frame.
     pub alignment: Alignment,
+    /// How the uncertainties were propagated.
+    pub uncertainty: Uncertainty,
     /// One for every sharp edge of the nominal.
     pub edges: Vec<Edge>,
     /// Where three faces or more meet.
@@ -58,6 +60,31 @@ pub struct Report {
     pub findings: Vec<String>,
     /// Seconds by stage, in order of the work.
     pub seconds: IndexMap<String, f64>,
+}
+
+/// How uncertainties were propagated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+pub struct Uncertainty {
+    /// Of d1, d2, the total, the included angle and the edge breaks; all others are of first order.
+    pub method: UncertaintyMethod,
+    /// Fewest and most trials of a station; null for first order.
+    pub trials: Option<[usize; 2]>,
+    /// Most trials of an edge break.
+    pub break_trials: Option<usize>,
+    /// Seed of the trials.
+    pub seed: Option<u64>,
+    /// Stations whose values did not stand still to two digits of u when the trials ended.
+    pub unstable_stations: Option<usize>,
+}
+
+/// How uncertainties were propagated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum UncertaintyMethod {
+    /// By first derivatives (JCGM 100).
+    FirstOrder,
+    /// By trials (JCGM 101).
+    MonteCarlo,
 }
 
 /// Name and version of the contract.
@@ -117,6 +144,8 @@ pub struct Recipe {
     pub conformance_probability: Option<f64>,
     /// Limits of every edge for which the recipe says nothing else.
     pub limits: Limits,
+    /// Whether tolerances of the nominal's PMI count as limits; each characteristic says where its own come from.
+    pub limits_from_pmi: bool,
     /// Share of an edge that must be measured for it to be decidable, 0 to 1.
     pub minimum_coverage: Option<f64>,
     /// Standard uncertainty of d1 and d2 from the calibration of the sensors, part of every u_d.
@@ -212,6 +241,63 @@ pub struct Alignment {
     pub weak_directions: Vec<String>,
     /// Ok, or not decidable.
     pub status: Status,
+    /// How the pose was found.
+    pub method: AlignmentMethod,
+    /// STEP entities of the faces of the best fit; empty = all.
+    pub faces: Vec<u64>,
+    /// The datum features that the pose rests on; empty for another method.
+    pub datums: Vec<Datum>,
+    /// What the datums leave free: there the pose is that of the best fit.
+    pub free_of_datums: Vec<String>,
+}
+
+/// How a pose was found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum AlignmentMethod {
+    /// The scan was taken as lying in the part frame.
+    AsGiven,
+    /// Least squares over the faces.
+    BestFit,
+    /// On datum features.
+    Datums,
+}
+
+/// A datum feature as measured.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Datum {
+    /// The recipe's name.
+    pub name: String,
+    /// What it holds.
+    pub kind: DatumKind,
+    /// 1 holds before 2, 2 before 3.
+    pub priority: u32,
+    /// STEP entities of its faces; empty for a reference point.
+    pub faces: Vec<u64>,
+    /// Points used.
+    pub points: usize,
+    /// How far it lies off its nominal place at the pose.
+    pub residual_mm: Option<f64>,
+    /// And off its nominal direction; null where it has none.
+    pub residual_deg: Option<f64>,
+    /// Standard uncertainty of its place.
+    pub u_mm: Option<f64>,
+    /// Standard deviation of its points about it: noise and form.
+    pub form_mm: Option<f64>,
+}
+
+/// What a datum feature holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum DatumKind {
+    /// A reference point: one direction.
+    Point,
+    /// A plane.
+    Plane,
+    /// The axis of a cylinder or cone.
+    Axis,
+    /// The centre of a sphere.
+    Centre,
 }
 
 /// Convex or concave.
@@ -237,6 +323,8 @@ pub struct Edge {
     pub length_mm: Option<f64>,
     /// Share of the length that was measured, 0 to 1.
     pub coverage: f64,
+    /// Share of the length of which only one flank was seen, 0 to 1.
+    pub boundary_share: Option<f64>,
     /// In order of arc length.
     pub stations: Vec<Station>,
     /// The shape of the edge itself, one a stretch of stations; empty where it was not seen.
@@ -282,6 +370,8 @@ pub struct Station {
     pub u_included_angle_deg: Option<f64>,
     /// Distance of the measured edge from the nominal one across the tangent, and its standard uncertainty.
     pub total_mm: Option<Value>,
+    /// The one flank that was seen, where only one was; then d1, d2 and the rest are null. Null elsewhere.
+    pub boundary: Option<Boundary>,
     /// What the deviation of each flank was modelled by.
     pub flank_models: Option<[FlankModel; 2]>,
     /// The highest place of the real profile along the bisector; null where the edge itself was not seen.
@@ -357,6 +447,20 @@ pub enum FlankModel {
     Displaced,
     /// A bend across the edge as well.
     Bent,
+}
+
+/// A station of which one flank was seen: a boundary of the scan.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
+pub struct Boundary {
+    /// The flank that was seen: 1 or 2.
+    pub flank: usize,
+    /// Where its face lies at the nominal edge.
+    pub point: Xyz,
+    /// Its deviation along the normal of its face; judged as d1 or d2.
+    pub d_mm: Value,
+    /// What its uncertainty is made of; only where it was asked for.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub budget: Option<Budget>,
 }
 
 /// Another point that stands for the edge at a station.
@@ -438,6 +542,8 @@ pub enum Shape {
     Round,
     /// A plane across both flanks.
     Chamfer,
+    /// Broken, and the data do not tell round from chamfer: radius and legs are given, of which one applies.
+    Undecided,
     /// Neither.
     Irregular,
 }
@@ -541,6 +647,8 @@ pub struct Characteristic {
     pub lower: Option<f64>,
     /// Upper limit; null = none on this side.
     pub upper: Option<f64>,
+    /// Where the limits come from: `recipe`, or the entity `#n` of the nominal's PMI; null without limits.
+    pub limits_from: Option<String>,
     /// Probability that the value conforms; null where the rule asks for none.
     pub conformance: Option<f64>,
     /// Worst verdict of all its values.

@@ -1,7 +1,7 @@
 //! Exact solids with known deviations, and scans of them: the truth that inspection is held against.
 
 use acies::geometry::RigidTransform;
-use acies::inspect::body::{Body, BodyEdge, BodySample};
+use acies::inspect::body::{Body, BodyEdge, BodySample, DatumShape};
 use acies::nominal::{EdgeKind, Foot, Station};
 use acies::points::{Frame, Origin, PointCloud, View};
 use glam::{DQuat, DVec2, DVec3};
@@ -198,7 +198,8 @@ impl Solid {
         }
     }
 
-    fn centre(&self, face: u32) -> DVec3 {
+    /// Where the deviation of a made face is its offset.
+    pub fn centre(&self, face: u32) -> DVec3 {
         match &self.faces[face as usize] {
             Shape::Plane {
                 origin,
@@ -512,6 +513,13 @@ impl Body for Solid {
             samples.iter().map(|s| s.point).reduce(pick).expect("faces")
         };
         [fold(DVec3::min), fold(DVec3::max)]
+    }
+
+    fn datum_shape(&self, face: u32) -> Option<DatumShape> {
+        Some(match &self.faces[face as usize] {
+            Shape::Plane { .. } | Shape::Disc { .. } => DatumShape::Plane,
+            Shape::Side { .. } => DatumShape::Axis(DVec3::ZERO, DVec3::Z),
+        })
     }
 }
 

@@ -343,3 +343,62 @@ fn form_along_an_edge_is_apart_from_its_place() {
             .is_some_and(|s| s.max.abs() < PI / 180.0)
     );
 }
+
+/// A drop that the laser does not look down: the front of a cuboid is not in the scan, and the edges of its neighbours with it are boundaries.
+#[test]
+fn the_boundary_of_a_drop_is_measured_along_the_flank_that_was_seen() {
+    let mut solid = Solid::cuboid(30.0, 9.0, 6.0);
+    let made = |offset, gradient| Made { offset, gradient };
+    solid.made[1] = made(0.07, DVec3::new(0.001, 0.0, 0.0));
+    solid.made[3] = made(-0.05, DVec3::new(0.0, 0.002, 0.0));
+    let text = |d: &str| format!("[[edge]]\nfaces = [11, 12]\n{d}");
+    let edges = solid.edges();
+    let front: Vec<usize> = (0..edges.len())
+        .filter(|e| edges[*e].faces.contains(&2) && !edges[*e].faces.contains(&0))
+        .collect();
+    let top = front.iter().position(|e| edges[*e].faces.contains(&1));
+    let top = front[top.expect("the top's front edge")];
+    let side = usize::from(edges[top].faces[1] == 1);
+    let (own, other) = (["d1_mm", "d2_mm"][side], ["d1_mm", "d2_mm"][1 - side]);
+    let (mut squares, mut count) = (0.0, 0.0);
+    for seed in 1..=3 {
+        let mut noise = Noise(200 + seed);
+        let cloud = solid.scan(&[1, 3, 4, 5], SIGMA, &mut noise);
+        let found = inspected(&solid, &cloud, &text(&format!("{own} = [-0.1, 0.1]")));
+        for e in &front {
+            for station in &found.edges[*e].stations {
+                assert!(station.measured.is_none());
+                let Some(seen) = station.boundary else {
+                    continue;
+                };
+                assert!(station.reason.starts_with("boundary: only flank"));
+                let face = edges[*e].faces[seen.flank];
+                assert_ne!(face, 2);
+                // Of a plane face the deviation at the nominal edge.
+                let truth = solid.made_at(face, station.station.point);
+                squares += ((seen.d_mm.value - truth) / seen.d_mm.u).powi(2);
+                count += 1.0;
+                assert!(seen.d_mm.u < SIGMA, "{seen:?}");
+            }
+        }
+        let edge = &found.edges[top];
+        assert_eq!(edge.coverage, 0.0);
+        assert!(edge.boundary_share > 0.9, "{}", edge.boundary_share);
+        assert_eq!(
+            edge.verdict,
+            Verdict::Ok,
+            "0.07 and half of 30 mm by 1 mrad lie within"
+        );
+    }
+    // Mean of n squares of standard normal numbers: 1 with a standard deviation of sqrt(2 / n), and some for the estimated noise.
+    let mean = squares / count;
+    let chance = 3.0 * f64::sqrt(2.0 / count) + 0.06;
+    assert!((mean - 1.0).abs() < chance, "{mean} of {count}");
+
+    let cloud = solid.scan(&[1, 3, 4, 5], SIGMA, &mut Noise(210));
+    let verdict = |limits: &str| inspected(&solid, &cloud, &text(limits)).edges[top].verdict;
+    assert_eq!(verdict(&format!("{own} = [-0.05, 0.05]")), Verdict::NotOk);
+    // What the unseen flank must be asked for decides nothing.
+    let both = format!("{own} = [-0.1, 0.1]\n{other} = [-0.1, 0.1]");
+    assert_eq!(verdict(&both), Verdict::NotDecidable);
+}

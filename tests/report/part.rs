@@ -9,7 +9,8 @@ use acies::inspect::flank::FlankModel;
 use acies::inspect::quantity::Quantity;
 use acies::inspect::recipe::{Limits, Recipe, Rule};
 use acies::inspect::result::{
-    Alignment, Budget, EdgeResult, Inspection, Measured, Quantified, StationResult, Verdict,
+    Alignment, Budget, DatumKind, DatumResult, EdgeResult, Inspection, Measured, Method,
+    Quantified, StationResult, Verdict,
 };
 use acies::nominal::{EdgeKind, Station};
 use acies::report::{DeviceFacts, Facts, ScanFacts};
@@ -141,6 +142,7 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
         return StationResult {
             station: place,
             measured: None,
+            boundary: None,
             points: [14, 0],
             verdict: Verdict::NotDecidable,
             reason: "no points on flank 2 within 3 mm of the edge".to_owned(),
@@ -160,6 +162,7 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
     let verdict = judge(d_mm, u_mm);
     StationResult {
         station: place,
+        boundary: None,
         measured: Some(Measured {
             point: point + d_mm[0] * normals[0] + d_mm[1] * normals[1],
             d_mm,
@@ -205,6 +208,7 @@ fn edge(index: usize, shape: &Shape, stations: usize, seed: &mut u64) -> EdgeRes
         kind: shape.kind,
         length_mm: shape.length_mm,
         coverage: measured as f64 / stations.len() as f64,
+        boundary_share: 0.0,
         breaks: Vec::new(),
         form: None,
         characteristics: Vec::new(),
@@ -244,6 +248,7 @@ pub fn inspection(stations: usize) -> Inspection {
         row[i] = if i < 3 { 4e-10 } else { 4e-6 };
     }
     let mut inspection = Inspection {
+        trials: None,
         corners: Vec::new(),
         gaps: Vec::new(),
         alignment: Alignment {
@@ -256,6 +261,20 @@ pub fn inspection(stations: usize) -> Inspection {
             covariance,
             weak_directions: vec![],
             status: Verdict::Ok,
+            method: Method::Datums,
+            datums: vec![DatumResult {
+                name: "A <top>".to_owned(),
+                kind: DatumKind::Plane,
+                priority: 1,
+                faces: vec![17],
+                points: 4_100,
+                residual_mm: 0.0,
+                residual_rad: Some(1e-5),
+                u_mm: 0.0004,
+                form_mm: 0.012,
+            }],
+            free_of_datums: vec!["rotation about z".to_owned()],
+            ..Alignment::default()
         },
         unexpected_edges: vec![vec![
             DVec3::new(10.0, 20.0, 40.0),

@@ -56,7 +56,7 @@ fn check_keyword(
             all.iter()
                 .all(|key| value.get(key.as_str().unwrap_or("?")).is_some())
         })),
-        "minimum" => fails(value.as_f64() >= rule.as_f64()),
+        "minimum" => fails(!value.is_number() || value.as_f64() >= rule.as_f64()),
         "minItems" => fails(length(value) >= rule.as_u64() || !value.is_array()),
         "maxItems" => fails(length(value) <= rule.as_u64() || !value.is_array()),
         "properties" => rule

@@ -3,10 +3,14 @@
 //! ISO 5459 names what a datum feature holds; here every feature contributes the equations of what it holds, weighted by their
 //! uncertainties, and the pose is their least-squares solution. Six reference points along three directions are the
 //! classical 3-2-1; features may hold more than six equations together, or fewer, and then the free motions are named.
-//! We differ: datums have no precedence; a primary datum is given it by a small uncertainty.
+//! Features of a lower priority number hold first, and those after them only what is left free (ISO 5459: primary, secondary, tertiary);
+//! features of one number share by their uncertainties.
+//! We differ: a datum is the least-squares feature of its points, not the one that touches the material from outside.
+
+use std::collections::BTreeMap;
 
 use glam::{DQuat, DVec3};
-use nalgebra::{Matrix6, SymmetricEigen, Vector6};
+use nalgebra::{DMatrix, Matrix6, SymmetricEigen, Vector6};
 
 use super::twist::{Twist, words};
 use crate::geometry::RigidTransform;
@@ -60,7 +64,7 @@ pub struct DatumPose {
     /// The pose.
     pub part_from_machine: RigidTransform,
     /// Covariance of (rotation vector in rad about the part origin, translation in mm) from the features' uncertainties; along what
-    /// they leave free it is the square of the features' extent.
+    /// they leave free it is that of the start, or where none was given the square of the features' extent.
     pub covariance: [[f64; 6]; 6],
     /// What the features leave free, in words; the pose keeps the start's there.
     pub weak_directions: Vec<String>,
@@ -85,19 +89,29 @@ pub enum DatumError {
 
 const STEPS: usize = 60;
 
-/// The pose that lays the measured features on the nominal ones, from `start`: right to some 60 degrees.
+/// The pose that lays the measured features on the nominal ones, all with one priority, from `start`: right to some 60 degrees.
 ///
 /// Residuals of the result tell which features contradict each other; with exactly six equations they are zero.
 pub fn pose_from_datums(start: RigidTransform, datums: &[Datum]) -> Result<DatumPose, DatumError> {
-    if let Some(bad) = datums.iter().position(|d| !d.is_usable()) {
+    let equal: Vec<(u32, Datum)> = datums.iter().map(|d| (1, *d)).collect();
+    pose_from_ordered_datums(start, None, &equal)
+}
+
+/// As [`pose_from_datums`], every feature with its priority: 1 holds before 2. The covariance of the start, where it is known, is that of
+/// the pose along what the features leave free.
+pub fn pose_from_ordered_datums(
+    start: RigidTransform,
+    start_covariance: Option<&[[f64; 6]; 6]>,
+    ordered: &[(u32, Datum)],
+) -> Result<DatumPose, DatumError> {
+    if let Some(bad) = ordered.iter().position(|(_, d)| !d.is_usable()) {
         return Err(DatumError::Bad(bad));
     }
-    let size_mm = extent_mm(datums);
+    let size_mm = extent_mm(ordered);
+    let solve = |pose: &RigidTransform| Systems::new(pose, ordered, size_mm).solve();
     let mut pose = start;
     for _ in 0..STEPS {
-        let system = System::new(&pose, datums, size_mm);
-        let (step, _) = system.solve();
-        let twist = Twist::from_scaled(&step, size_mm);
+        let twist = Twist::from_scaled(&solve(&pose).step, size_mm);
         // A wild step of a far start must not turn the part over.
         let share = (0.7 / twist.turn.length().max(1e-30)).min(1.0);
         pose = Twist {
@@ -111,26 +125,33 @@ pub fn pose_from_datums(start: RigidTransform, datums: &[Datum]) -> Result<Datum
         .transform()
             * pose;
         if twist.size(size_mm) < 1e-13 * (size_mm + pose.translation.length()) {
-            return Ok(described(pose, datums, size_mm));
+            return Ok(described(pose, start_covariance, ordered, size_mm));
         }
     }
     // Rounding may keep the last steps at a few units of the last place.
-    let system = System::new(&pose, datums, size_mm);
-    if Twist::from_scaled(&system.solve().0, size_mm).size(size_mm) < 1e-9 * size_mm {
-        return Ok(described(pose, datums, size_mm));
+    if Twist::from_scaled(&solve(&pose).step, size_mm).size(size_mm) < 1e-9 * size_mm {
+        return Ok(described(pose, start_covariance, ordered, size_mm));
     }
     Err(DatumError::NoPose(STEPS))
 }
 
-fn described(pose: RigidTransform, datums: &[Datum], size_mm: f64) -> DatumPose {
-    let system = System::new(&pose, datums, size_mm);
-    let (_, weak) = system.solve();
-    let mut matrix = system.matrix;
-    for w in &weak {
-        matrix += w * w.transpose() / size_mm.powi(2);
-    }
-    let inverse = matrix.try_inverse().unwrap_or_else(Matrix6::zeros);
+fn described(
+    pose: RigidTransform,
+    start_covariance: Option<&[[f64; 6]; 6]>,
+    ordered: &[(u32, Datum)],
+    size_mm: f64,
+) -> DatumPose {
+    let systems = Systems::new(&pose, ordered, size_mm);
+    let Solved {
+        covariance, weak, ..
+    } = systems.solve();
     let unit = |k: usize| if k < 3 { 1.0 / size_mm } else { 1.0 };
+    let free: Matrix6<f64> = weak.iter().map(|w| w * w.transpose()).sum();
+    let of_start = match start_covariance {
+        Some(c) => Matrix6::from_fn(|i, j| c[i][j] / (unit(i) * unit(j))),
+        None => Matrix6::identity() * size_mm.powi(2),
+    };
+    let scaled = covariance + free * of_start * free;
     let twists: Vec<Twist> = weak
         .iter()
         .map(|w| Twist::from_scaled(w, size_mm))
@@ -138,68 +159,93 @@ fn described(pose: RigidTransform, datums: &[Datum], size_mm: f64) -> DatumPose 
     DatumPose {
         part_from_machine: pose,
         covariance: std::array::from_fn(|i| {
-            std::array::from_fn(|j| inverse[(i, j)] * unit(i) * unit(j))
+            std::array::from_fn(|j| scaled[(i, j)] * unit(i) * unit(j))
         }),
         weak_directions: words(&twists, size_mm),
-        residuals: system.worst,
+        residuals: systems.worst,
     }
 }
 
 /// Half the extent of the nominal places, at least 1 mm.
-fn extent_mm(datums: &[Datum]) -> f64 {
-    let places = || datums.iter().map(Datum::place);
+fn extent_mm(ordered: &[(u32, Datum)]) -> f64 {
+    let places = || ordered.iter().map(|(_, d)| d.place());
     let low = places().reduce(DVec3::min).unwrap_or(DVec3::ZERO);
     let high = places().reduce(DVec3::max).unwrap_or(DVec3::ZERO);
     (0.5 * (high - low).length()).max(1.0)
 }
 
-/// Normal equations at a pose, in unknowns that are all mm.
-struct System {
-    matrix: Matrix6<f64>,
-    right: Vector6<f64>,
+/// Normal equations at a pose, in unknowns that are all mm: a matrix and a right side for every priority, the first in front.
+struct Systems {
+    groups: BTreeMap<u32, (Matrix6<f64>, Vector6<f64>)>,
     worst: Vec<f64>,
-    size_mm: f64,
 }
 
-impl System {
-    fn new(pose: &RigidTransform, datums: &[Datum], size_mm: f64) -> Self {
-        let mut system = Self {
-            matrix: Matrix6::zeros(),
-            right: Vector6::zeros(),
-            worst: Vec::with_capacity(datums.len()),
-            size_mm,
-        };
-        for datum in datums {
+/// A step with what it is worth.
+struct Solved {
+    step: Vector6<f64>,
+    /// Of the unknowns, without what is weak.
+    covariance: Matrix6<f64>,
+    /// Unit vectors that no group holds.
+    weak: Vec<Vector6<f64>>,
+}
+
+impl Systems {
+    fn new(pose: &RigidTransform, ordered: &[(u32, Datum)], size_mm: f64) -> Self {
+        let mut groups: BTreeMap<u32, (Matrix6<f64>, Vector6<f64>)> = BTreeMap::new();
+        let mut all = Vec::with_capacity(ordered.len());
+        for (priority, datum) in ordered {
+            let (matrix, right) = groups.entry(*priority).or_default();
             let mut worst: f64 = 0.0;
             datum.equations(pose, |turn, shift, residual, u| {
-                let lever = turn / system.size_mm;
+                let lever = turn / size_mm;
                 let row = Vector6::new(lever.x, lever.y, lever.z, shift.x, shift.y, shift.z) / u;
-                system.matrix.ger(1.0, &row, &row, 1.0);
-                system.right.axpy(-residual / u, &row, 1.0);
+                matrix.ger(1.0, &row, &row, 1.0);
+                right.axpy(-residual / u, &row, 1.0);
                 worst = worst.max((residual / u).abs());
             });
-            system.worst.push(worst);
+            all.push(worst);
         }
-        system
+        Self { groups, worst: all }
     }
 
-    /// The step along what the features hold, and what they do not.
-    fn solve(&self) -> (Vector6<f64>, Vec<Vector6<f64>>) {
-        let eigen = SymmetricEigen::new(self.matrix);
-        let largest = eigen.eigenvalues.max();
+    /// Group by group: each moves what those before it left free.
+    fn solve(&self) -> Solved {
         let mut step = Vector6::zeros();
-        let mut weak = Vec::new();
-        for k in 0..6 {
-            let vector = eigen.eigenvectors.column(k).into_owned();
-            let value = eigen.eigenvalues[k];
-            // Held a thousand times worse than anything sensible: rounding, or features too close together.
-            if value <= 1e-9 * largest || value <= 0.0 {
-                weak.push(vector);
-            } else {
-                step += vector * (vector.dot(&self.right) / value);
+        let mut covariance = Matrix6::zeros();
+        let mut free: Vec<Vector6<f64>> = (0..6)
+            .map(|k| Matrix6::identity().column(k).into_owned())
+            .collect();
+        for (matrix, right) in self.groups.values() {
+            if free.is_empty() {
+                break;
             }
+            let basis = DMatrix::from_fn(6, free.len(), |i, k| free[k][i]);
+            let inside = basis.transpose() * matrix * &basis;
+            let largest = SymmetricEigen::new(*matrix).eigenvalues.max();
+            let eigen = SymmetricEigen::new(inside);
+            let mut held = Matrix6::zeros();
+            let mut left = Vec::new();
+            for k in 0..free.len() {
+                let own = &basis * eigen.eigenvectors.column(k);
+                let vector = Vector6::from_fn(|i, _| own[i]);
+                let value = eigen.eigenvalues[k];
+                // Held a thousand times worse than what else the group holds: rounding, or features too close together, or too parallel.
+                if value <= 1e-6 * largest || value <= 0.0 {
+                    left.push(vector);
+                } else {
+                    held += vector * vector.transpose() / value;
+                }
+            }
+            step += held * (right - matrix * step);
+            let kept = Matrix6::identity() - held * matrix;
+            covariance = kept * covariance * kept.transpose() + held;
+            free = left;
         }
-        (step, weak)
+        Solved {
+            step,
+            covariance,
+            weak: free,
+        }
     }
 }
 
@@ -242,6 +288,20 @@ impl Datum {
                     && u.iter().all(|u| positive(*u))
             }
         }
+    }
+
+    /// How far the measured feature lies off the nominal one at `pose`: mm, and for a feature with a direction rad.
+    pub fn off(&self, pose: &RigidTransform) -> (f64, Option<f64>) {
+        let (mut squares, mut angles) = (0.0, 0.0);
+        self.equations(pose, |_, shift, residual, _| {
+            if shift == DVec3::ZERO {
+                angles += residual * residual;
+            } else {
+                squares += residual * residual;
+            }
+        });
+        let directed = matches!(self, Self::Plane { .. } | Self::Axis { .. });
+        (f64::sqrt(squares), directed.then(|| f64::sqrt(angles)))
     }
 
     /// Gives every equation to `add`: how turn and shift of the scan change it, its residual, and its standard uncertainty.

@@ -1,5 +1,7 @@
 //! Round, chamfer or sharp: signed distances to each shape, least squares in them, and the choice between them.
 
+use nalgebra::{Matrix4, SMatrix, Vector4};
+
 use super::{ONE_SIDED, Quantified, WedgePoint, Zone};
 use crate::geometry::fit::{NormalSums, TRIM, mad_sigma};
 
@@ -25,7 +27,18 @@ pub(super) enum Fitted {
         legs: [f64; 2],
         covariance: [[f64; 2]; 2],
     },
+    /// Broken, and either of the two; the one that fits better decides the sizes that every shape has.
+    Undecided {
+        radius: Quantified,
+        legs: [f64; 2],
+        covariance: [[f64; 2]; 2],
+        round: bool,
+    },
 }
+
+/// How much better one shape must be than another to be called decided: 2 ln of the Bayes factor, "strong" from 6 on (Kass and Raftery
+/// 1995).
+const DECIDED: f64 = 6.0;
 
 /// Residuals are cut at this many standard deviations where shapes are compared.
 const CLIP: f64 = 3.0;
@@ -70,37 +83,42 @@ fn shape_of<const P: usize>(p: &[f64; P]) -> Shape {
 }
 
 /// The shape that the data choose, by the Bayesian information criterion with the flanks' noise (Schwarz 1978); a
-/// radius below twice its uncertainty is none, with the upper bound of a score test.
+/// radius below twice its uncertainty is none, with the upper bound of a score test. A radius and a chamfer that fit nearly alike are
+/// not told apart.
 pub(super) fn choose(zone: &Zone<'_>) -> Fitted {
     let penalty = (zone.points.len() as f64).ln();
-    let sharp = zone.misfit(&Shape::Sharp, 1);
+    let sharp = zone.deviance(&Shape::Sharp);
     let round = zone.start_round().and_then(|start| zone.fit([start]));
-    let of_round = round.map_or(f64::MAX, |r| {
-        zone.misfit(&Shape::Round(r.0[0]), 1) + penalty
-    });
+    let of_round = round.map_or(f64::MAX, |r| zone.deviance(&Shape::Round(r.0[0])) + penalty);
     // Where a radius gains nothing over the sharp edge neither does a chamfer.
     let chamfer = (of_round < sharp)
         .then(|| zone.fit(zone.start_chamfer()))
         .flatten();
     let of_chamfer = chamfer.map_or(f64::MAX, |c| {
-        zone.misfit(&Shape::Chamfer(c.0[0], c.0[1]), 1) + 2.0 * penalty
+        zone.deviance(&Shape::Chamfer(c.0[0], c.0[1])) + 2.0 * penalty
     });
-    if let Some((legs, covariance)) = chamfer
-        && of_chamfer < of_round
-        && (0..2).all(|i| legs[i] > 2.0 * covariance[i][i].sqrt())
-    {
-        return Fitted::Chamfer { legs, covariance };
-    }
-    if let Some(([radius], covariance)) = round
-        && of_round < sharp
-        && radius > 2.0 * covariance[0][0].sqrt()
-    {
-        return Fitted::Round {
-            radius: Quantified {
-                value: radius,
-                u: covariance[0][0].sqrt(),
-            },
-        };
+    let chamfer = chamfer.filter(|(legs, c)| (0..2).all(|i| legs[i] > 2.0 * c[i][i].sqrt()));
+    let round = round
+        .map(|([radius], c)| Quantified {
+            value: radius,
+            u: c[0][0].sqrt(),
+        })
+        .filter(|radius| of_round < sharp && radius.value > 2.0 * radius.u);
+    let either = (of_round - of_chamfer).abs() < DECIDED;
+    match (round, chamfer) {
+        (Some(radius), Some((legs, covariance))) if either => {
+            return Fitted::Undecided {
+                radius,
+                legs,
+                covariance,
+                round: of_round <= of_chamfer,
+            };
+        }
+        (_, Some((legs, covariance))) if of_chamfer < of_round => {
+            return Fitted::Chamfer { legs, covariance };
+        }
+        (Some(radius), _) => return Fitted::Round { radius },
+        _ => {}
     }
     Fitted::Sharp {
         radius_below: zone.radius_below(),
@@ -123,6 +141,38 @@ impl Zone<'_> {
                 (e * e).min(CLIP * CLIP)
             })
             .sum()
+    }
+
+    /// The misfit that stays when the flanks move within their uncertainty to where it is least: what the flanks' errors add to the
+    /// residuals speaks for no shape. Points that the flanks were fitted to have said what they know of them already.
+    fn deviance(&self, shape: &Shape) -> f64 {
+        let wedges = &self.stretch.wedges;
+        let mut sums = vec![(Matrix4::<f64>::zeros(), Vector4::<f64>::zeros()); wedges.len()];
+        let mut misfit = 0.0;
+        for q in &self.points {
+            let e = shape.distance(q.d, self.turns[q.wedge]) / self.sigma;
+            misfit += (e * e).min(CLIP * CLIP);
+            if q.free && e.abs() < CLIP {
+                let row = Vector4::from(self.by_flanks(shape, q)) / self.sigma;
+                let (matrix, right) = &mut sums[q.wedge];
+                matrix.ger(1.0, &row, &row, 1.0);
+                right.axpy(e, &row, 1.0);
+            }
+        }
+        for (wedge, (matrix, right)) in wedges.iter().zip(&sums) {
+            let prior = Matrix4::from_fn(|i, j| {
+                let (f, g) = (i / 2, j / 2);
+                if f == g {
+                    self.stretch.shared_factor[f] * wedge.flanks[f].covariance[i % 2][j % 2]
+                } else {
+                    0.0
+                }
+            });
+            if let Some(inverse) = (Matrix4::identity() + prior * matrix).try_inverse() {
+                misfit -= right.dot(&(inverse * prior * right));
+            }
+        }
+        misfit
     }
 
     fn start_round(&self) -> Option<f64> {
@@ -154,13 +204,22 @@ impl Zone<'_> {
     /// Gauss-Newton on the distances within [`TRIM`] standard deviations; the parameters and their covariance, the flanks' share
     /// included. `None` where the data do not hold them.
     fn fit<const P: usize>(&self, start: [f64; P]) -> Option<([f64; P], [[f64; P]; P])> {
+        let p = self.descend(start)?;
+        let e = self.residuals(&shape_of(&p));
+        let covariance = self.covariance(&p, &e)?;
+        Some((p, covariance))
+    }
+
+    fn residuals(&self, shape: &Shape) -> Vec<f64> {
+        let of = |q: &WedgePoint| shape.distance(q.d, self.turns[q.wedge]);
+        self.points.iter().map(of).collect()
+    }
+
+    /// The parameters alone.
+    pub(super) fn descend<const P: usize>(&self, start: [f64; P]) -> Option<[f64; P]> {
         let mut p = start;
-        let residuals = |shape: &Shape| -> Vec<f64> {
-            let of = |q: &WedgePoint| shape.distance(q.d, self.turns[q.wedge]);
-            self.points.iter().map(of).collect()
-        };
         for _ in 0..40 {
-            let e = residuals(&shape_of(&p));
+            let e = self.residuals(&shape_of(&p));
             let limit = TRIM * mad_sigma(&e).max(self.sigma);
             let mut sums = NormalSums::<P>::default();
             for (q, e) in self.points.iter().zip(&e) {
@@ -184,9 +243,7 @@ impl Zone<'_> {
         }) {
             return None;
         }
-        let e = residuals(&shape_of(&p));
-        let covariance = self.covariance(&p, &e)?;
-        Some((p, covariance))
+        Some(p)
     }
 
     fn gradient<const P: usize>(&self, p: &[f64; P], q: &WedgePoint) -> [f64; P] {
@@ -238,18 +295,57 @@ impl Zone<'_> {
             }
         }
         let (_, cofactor) = sums.solve()?;
+        // Points near the end of a leg weigh most there, and noise takes them on and off it: what the parameters answer to is the
+        // change of the whole score, not the sum of squared gradients.
+        let cofactor = self.answer(p, TRIM * scale).unwrap_or(cofactor);
+        let spread = sums.matrix();
         let noise = scale * scale;
         let shared = self.flank_scatter(&by_flanks);
         Some(std::array::from_fn(|i| {
             std::array::from_fn(|j| {
-                let mut sum = noise * cofactor[i][j];
+                let mut sum = 0.0;
                 for a in 0..P {
                     for b in 0..P {
-                        sum += cofactor[i][a] * shared[a][b] * cofactor[b][j];
+                        let score = noise * spread[a][b] + shared[a][b];
+                        sum += cofactor[i][a] * score * cofactor[j][b];
                     }
                 }
                 sum
             })
+        }))
+    }
+
+    /// How the parameters answer to the score, the sum of gradient times residual: the inverse of its change over a standard deviation
+    /// of the points to either side.
+    fn answer<const P: usize>(&self, p: &[f64; P], limit: f64) -> Option<[[f64; P]; P]> {
+        let score = |p: &[f64; P]| -> [f64; P] {
+            let shape = shape_of(p);
+            let mut sum = [0.0; P];
+            for q in &self.points {
+                let e = shape.distance(q.d, self.turns[q.wedge]);
+                if e.abs() <= limit {
+                    for (sum, g) in sum.iter_mut().zip(self.gradient(p, q)) {
+                        *sum += g * e;
+                    }
+                }
+            }
+            sum
+        };
+        let mut change = SMatrix::<f64, P, P>::zeros();
+        for k in 0..P {
+            let step = self.sigma.min(0.2 * p[k]);
+            let mut moved = *p;
+            moved[k] = p[k] + step;
+            let more = score(&moved);
+            moved[k] = p[k] - step;
+            let less = score(&moved);
+            for i in 0..P {
+                change[(i, k)] = (more[i] - less[i]) / (2.0 * step);
+            }
+        }
+        let inverse = change.try_inverse()?;
+        Some(std::array::from_fn(|i| {
+            std::array::from_fn(|j| inverse[(i, j)])
         }))
     }
 

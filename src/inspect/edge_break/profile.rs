@@ -1,8 +1,11 @@
 //! The profile of an edge without a model: mean heights over each flank in bins, and the extremes that they show.
 
+use std::ops::Range;
+
 use super::fit::Shape;
 use super::{Form, Quantified, Zone};
 use crate::geometry::fit::{mad_sigma, median};
+use crate::inspect::monte_carlo::Draws;
 
 /// Bins on each flank, at most.
 const BINS: f64 = 28.0;
@@ -15,6 +18,9 @@ const COUNT_MIN: f64 = 5.0;
 
 /// Standard uncertainties at which a bin lies off a flank: 56 bins are asked, so that a false alarm is rare.
 const LEFT: f64 = 4.0;
+
+/// Bins of a plateau up to which its ends count for much.
+const FEW: usize = 4;
 
 /// A shape is refused where a bin lies off it by this much of the noise of one point: less is form, and no burr or notch.
 const OFF_SHAPE: f64 = 1.5;
@@ -94,43 +100,83 @@ impl Profile {
         })
     }
 
-    /// The largest height over each flank, `sign` 1, or depth, `sign` -1: the mean of the extreme bin and of its neighbours that
-    /// cannot be told from it; 0 where none is significant.
-    fn extreme(&self, side: usize, sign: f64) -> Quantified {
+    /// The bins that make up the largest height over a flank, `sign` 1, or depth, `sign` -1, and their mean height: the extreme bin and its
+    /// neighbours that cannot be told from it. `None` where no bin is significantly off the flank.
+    fn plateau(&self, side: usize, sign: f64) -> Option<(Range<usize>, f64)> {
         let bins = &self.sides[side];
-        let best = (0..bins.len())
-            .filter(|k| bins[*k].counts())
-            .max_by(|a, b| (sign * bins[*a].height).total_cmp(&(sign * bins[*b].height)));
-        let Some(best) = best else {
-            return Quantified {
-                value: 0.0,
-                u: self.width,
-            };
-        };
+        let best = self.best(side, sign)?;
         let top = bins[best];
         if sign * top.height <= LEFT * top.u {
-            return Quantified {
-                value: 0.0,
-                u: top.u,
-            };
+            return None;
         }
         let alike = |k: &usize| {
             let bin = bins[*k];
             bin.counts() && (bin.height - top.height).abs() <= 2.0 * bin.u.hypot(top.u)
         };
-        let up = (best + 1..bins.len()).take_while(alike);
-        let down = (0..best).rev().take_while(alike);
+        let up = (best + 1..bins.len()).take_while(alike).count();
+        let down = (0..best).rev().take_while(alike).count();
+        let chosen = best - down..best + up + 1;
         let (mut weight, mut sum) = (0.0, 0.0);
-        for k in up.chain(down).chain([best]) {
-            weight += bins[k].u.powi(-2);
-            sum += bins[k].height * bins[k].u.powi(-2);
+        for bin in &bins[chosen.clone()] {
+            weight += bin.u.powi(-2);
+            sum += bin.height * bin.u.powi(-2);
         }
-        // How far the plateau lies below its own best bin shows what bins half on a wall take away, and luck adds.
-        let mean = sum / weight;
+        Some((chosen, sum / weight))
+    }
+
+    /// The extreme bin.
+    fn best(&self, side: usize, sign: f64) -> Option<usize> {
+        let bins = &self.sides[side];
+        (0..bins.len())
+            .filter(|k| bins[*k].counts())
+            .max_by(|a, b| (sign * bins[*a].height).total_cmp(&(sign * bins[*b].height)))
+    }
+
+    /// The largest height over each flank, `sign` 1, or depth, `sign` -1; 0 where none is significant.
+    fn extreme(&self, side: usize, sign: f64) -> Quantified {
+        let bins = &self.sides[side];
+        let Some(best) = self.best(side, sign) else {
+            return Quantified {
+                value: 0.0,
+                u: self.width,
+            };
+        };
+        let Some((chosen, mean)) = self.plateau(side, sign) else {
+            return Quantified {
+                value: 0.0,
+                u: bins[best].u,
+            };
+        };
+        // How far the plateau lies below its own best bin shows what bins half on a wall take away, and luck adds. Of a few bins the ends,
+        // which are such, are a large part.
+        let share = if chosen.len() <= FEW { 1.0 } else { 0.5 };
+        let weight: f64 = bins[chosen].iter().map(|bin| bin.u.powi(-2)).sum();
+        let fall = share * (bins[best].height - mean);
         Quantified {
             value: sign * mean,
-            u: weight.sqrt().recip().hypot(0.5 * (top.height - mean)),
+            u: weight.sqrt().recip().hypot(fall),
         }
+    }
+
+    /// The excess with new noise on every bin: bins of the plateau are drawn about its mean, the others about what they show.
+    pub(super) fn excess_again(&self, draws: &mut Draws) -> [Quantified; 2] {
+        let mut drawn = Self {
+            sides: self.sides.clone(),
+            ..*self
+        };
+        for (side, bins) in drawn.sides.iter_mut().enumerate() {
+            let plateau = self.plateau(side, 1.0);
+            let level = plateau.as_ref().map(|p| p.1);
+            for (k, bin) in bins.iter_mut().enumerate().filter(|(_, b)| b.counts()) {
+                if let (Some((chosen, _)), Some(level)) = (&plateau, level)
+                    && chosen.contains(&k)
+                {
+                    bin.height = level;
+                }
+                bin.height += bin.u * draws.normal();
+            }
+        }
+        drawn.excess()
     }
 
     /// Excess over each flank.

@@ -6,7 +6,10 @@ use glam::DVec3;
 use sha2::{Digest, Sha256};
 use toml::Value;
 
-use super::{EdgeKey, EdgeRecipe, Expansion, GapRecipe, Limits, Recipe, Rule, Select};
+use super::{
+    DatumRecipe, DatumSource, EdgeKey, EdgeRecipe, Expansion, GapRecipe, Limits, Recipe, Rule,
+    Select,
+};
 use crate::inspect::quantity::{PAIRS, Quantity, Unit};
 use crate::nominal::EdgeKind;
 
@@ -48,16 +51,20 @@ fn recipe(keys: &mut Keys) -> Recipe {
     inner(keys, "environment", |keys| {
         temperature_c = pair(keys, "temperature_c");
     });
+    let mut datums = Vec::new();
+    inner(keys, "alignment", |keys| datums = read_datums(keys));
     let mut expansion = None;
     inner(keys, "expansion", |keys| expansion = read_expansion(keys));
     Recipe {
         sha256: String::new(),
         rule: rule(keys).unwrap_or(default.rule),
         limits,
+        limits_from_pmi: keys.flag("limits_from_pmi").unwrap_or_default(),
         corner_mm,
         edges: edges(keys),
         gaps: gaps(keys),
         datum_faces: entities(keys, "datum_faces").unwrap_or_default(),
+        datums,
         minimum_coverage: keys
             .number("minimum_coverage", 0.0..=1.0)
             .unwrap_or(default.minimum_coverage),
@@ -104,6 +111,81 @@ fn held(keys: &mut Keys) -> Option<[bool; 6]> {
             held[place] = true;
         }
         Some(held)
+    })
+}
+
+fn read_datums(keys: &mut Keys) -> Vec<DatumRecipe> {
+    let mut datums: Vec<DatumRecipe> = Vec::new();
+    for (k, table) in keys.tables("datum").into_iter().enumerate() {
+        let mut inner = Keys::new(table);
+        let datum = datum(&mut inner, k);
+        keys.adopt(&format!("datum[{k}]"), inner);
+        let Some(datum) = datum else { continue };
+        if datums.iter().any(|above| above.name == datum.name) {
+            let place = format!("datum[{k}].name");
+            keys.wrong(
+                &place,
+                format!("{:?} again", datum.name),
+                "one name a datum",
+            );
+        }
+        datums.push(datum);
+    }
+    datums
+}
+
+fn datum(keys: &mut Keys, index: usize) -> Option<DatumRecipe> {
+    const KEYS: [&str; 3] = ["faces", "point_mm", "pmi"];
+    const OF_POINTS: [&str; 2] = ["direction", "radius_mm"];
+    let given: Vec<&str> = KEYS.into_iter().filter(|key| keys.contains(key)).collect();
+    let is_point = given == ["point_mm"];
+    if given.len() != 1 {
+        let found = if given.is_empty() {
+            "nothing".to_owned()
+        } else {
+            given.join(" and ")
+        };
+        keys.wrong("faces", found, "one of faces, point_mm and pmi");
+    }
+    for key in OF_POINTS {
+        if keys.contains(key) && !is_point {
+            keys.wrong(
+                key,
+                "no point_mm beside it",
+                "it with a reference point only",
+            );
+        }
+    }
+    let faces = keys.read("faces", "the STEP entities of its faces", |value| {
+        let faces: Option<Vec<u64>> = value.as_array()?.iter().map(entity).collect();
+        faces.filter(|faces| !faces.is_empty())
+    });
+    let point = keys.read("point_mm", "a place, as in [10, 0, 5]", |value| {
+        numbers(value).map(DVec3::from)
+    });
+    let direction = keys.read("direction", "a direction, as in [0, 0, 1]", |value| {
+        numbers(value)
+            .map(DVec3::from)
+            .filter(|d| d.length() > 1e-9)
+    });
+    let radius_mm = keys.number("radius_mm", 1e-3..=1e4);
+    let pmi = keys.text("pmi");
+    let name = keys.text("name").or_else(|| pmi.clone());
+    let priority = keys.integer("priority", 1..=6).unwrap_or(1);
+    let source = match (faces, point, pmi) {
+        (Some(faces), None, None) => DatumSource::Faces(faces),
+        (None, Some(nominal), None) => DatumSource::Point {
+            nominal,
+            direction,
+            radius_mm,
+        },
+        (None, None, Some(letter)) => DatumSource::Pmi(letter),
+        _ => return None,
+    };
+    Some(DatumRecipe {
+        name: name.unwrap_or_else(|| format!("datum {}", index + 1)),
+        priority: priority as u32,
+        source,
     })
 }
 

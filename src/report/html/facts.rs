@@ -5,7 +5,10 @@ use std::fmt::{self, Write};
 use super::page::{Escaped, State};
 use super::percent;
 use crate::report::figure::{COVERAGE_FACTOR, Figure};
-use crate::report::wire::{Alignment, Losses, Quantity, Recipe, Report, Rule};
+use crate::report::wire::{
+    Alignment, AlignmentMethod, Datum, DatumKind, Losses, Quantity, Recipe, Report, Rule,
+    Uncertainty, UncertaintyMethod,
+};
 
 /// Items of a list that a page shows; more are read by nobody.
 const LISTED: usize = 40;
@@ -25,6 +28,7 @@ pub fn write(out: &mut String, report: &Report) -> fmt::Result {
         "<section class=\"card\"><h2>How it was measured</h2>\n<div class=\"columns\"><div>\n",
     )?;
     write_recipe(out, &report.recipe)?;
+    write_uncertainty(out, &report.uncertainty)?;
     write_alignment(out, &report.alignment)?;
     out.write_str("</div><div>\n")?;
     write_scan(out, report)?;
@@ -110,6 +114,13 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
         );
         row(out, name, &text)?;
     }
+    if recipe.limits_from_pmi {
+        row(
+            out,
+            "of the nominal",
+            "tolerances of its PMI, named beside the values",
+        )?;
+    }
     let rule = match (recipe.rule, recipe.guard_band_k) {
         (Rule::Simple, _) => "the value alone decides".to_owned(),
         (Rule::GuardBand, k) => format!(
@@ -137,12 +148,98 @@ fn write_recipe(out: &mut String, recipe: &Recipe) -> fmt::Result {
     out.write_str("</table>\n")
 }
 
+fn write_uncertainty(out: &mut String, used: &Uncertainty) -> fmt::Result {
+    out.write_str("<h4>Uncertainty</h4><table class=\"facts\">")?;
+    match (used.method, used.trials) {
+        (UncertaintyMethod::MonteCarlo, Some([least, most])) => {
+            row(out, "propagated by", "trials (Monte Carlo, JCGM 101)")?;
+            let (least, most) = (grouped(least as u64), grouped(most as u64));
+            let each = if least == most {
+                most
+            } else {
+                format!("{least} to {most}")
+            };
+            row(out, "trials of a station", &each)?;
+            if let Some(trials) = used.break_trials {
+                row(out, "trials of an edge break", &grouped(trials as u64))?;
+            }
+            if let Some(seed) = used.seed {
+                row(out, "seed", &seed.to_string())?;
+            }
+            if let Some(unstable) = used.unstable_stations.filter(|n| *n > 0) {
+                row(
+                    out,
+                    "stations that did not stand still",
+                    &unstable.to_string(),
+                )?;
+            }
+        }
+        _ => row(out, "propagated by", "first derivatives (JCGM 100)")?,
+    }
+    out.write_str("</table>\n")
+}
+
+/// `datums A, B, C`, or the faces of the best fit.
+fn found_by(alignment: &Alignment) -> String {
+    match alignment.method {
+        AlignmentMethod::AsGiven => "nothing: the scan is taken as it lies".to_owned(),
+        AlignmentMethod::Datums => {
+            let names: Vec<&str> = alignment.datums.iter().map(|d| d.name.as_str()).collect();
+            let mut text = format!("datums {}", names.join(", "));
+            if !alignment.free_of_datums.is_empty() {
+                text += "; best fit in what they leave free: ";
+                text += &alignment.free_of_datums.join(", ");
+            }
+            text
+        }
+        AlignmentMethod::BestFit if alignment.faces.is_empty() => {
+            "best fit of all faces".to_owned()
+        }
+        AlignmentMethod::BestFit => {
+            let faces: Vec<String> = alignment.faces.iter().map(|f| format!("#{f}")).collect();
+            format!("best fit of the faces {}", faces.join(", "))
+        }
+    }
+}
+
+/// One row a datum feature; nothing where there are none.
+fn write_datums(out: &mut String, datums: &[Datum]) -> fmt::Result {
+    if datums.is_empty() {
+        return Ok(());
+    }
+    out.write_str(
+        "<table class=\"facts\"><thead><tr><th>datum</th><th>holds</th><th>priority</th><th>off by</th><th>U of its place</th><th>form and noise</th></tr></thead><tbody>",
+    )?;
+    for datum in datums {
+        let holds = match datum.kind {
+            DatumKind::Point => "a point",
+            DatumKind::Plane => "a plane",
+            DatumKind::Axis => "an axis",
+            DatumKind::Centre => "a centre",
+        };
+        let turned = datum
+            .residual_deg
+            .map_or_else(String::new, |angle| format!(", {angle:.4} °"));
+        writeln!(
+            out,
+            "<tr><th scope=\"row\">{}</th><td>{holds}</td><td>{}</td><td>{}{turned}</td><td>{}</td><td>{}</td></tr>",
+            Escaped(&datum.name),
+            datum.priority,
+            um(datum.residual_mm),
+            um(datum.u_mm.map(|u| COVERAGE_FACTOR * u)),
+            um(datum.form_mm),
+        )?;
+    }
+    out.write_str("</tbody></table>\n")
+}
+
 fn write_alignment(out: &mut String, alignment: &Alignment) -> fmt::Result {
     writeln!(
         out,
         "<h4>Alignment to the nominal {}</h4><table class=\"facts\">",
         State(alignment.status)
     )?;
+    row(out, "found by", &found_by(alignment))?;
     row(out, "residuals, root mean square", &um(alignment.rms_mm))?;
     row(out, "points used", &grouped(alignment.points as u64))?;
     let weak = if alignment.weak_directions.is_empty() {
@@ -171,6 +268,7 @@ fn write_alignment(out: &mut String, alignment: &Alignment) -> fmt::Result {
         )?;
     }
     out.write_str("</table>\n")?;
+    write_datums(out, &alignment.datums)?;
     let Some(matrix) = alignment.part_from_machine else {
         return out.write_str("<p>No pose was found.</p>\n");
     };

@@ -82,14 +82,18 @@ fn expanded(quantity: Quantity, u: f64) -> String {
 
 fn limits(found: &Characteristic) -> String {
     let figure = |limit| Figure::of(found.quantity, limit, None);
-    match (found.lower, found.upper) {
+    let mut text = match (found.lower, found.upper) {
         (Some(lower), Some(upper)) => {
             format!("{} to {}", figure(lower).value, figure(upper).with_unit())
         }
         (None, Some(upper)) => format!("at most {}", figure(upper).with_unit()),
         (Some(lower), None) => format!("at least {}", figure(lower).with_unit()),
-        (None, None) => String::new(),
+        (None, None) => return String::new(),
+    };
+    if let Some(entity) = found.limits_from.as_deref().filter(|f| f.starts_with('#')) {
+        text += &format!(" (PMI {entity})");
     }
+    text
 }
 
 /// One line a kind of shape: over how much of the edge, and between which sizes.
@@ -99,7 +103,13 @@ fn write_breaks(out: &mut String, edge: &Edge) -> fmt::Result {
         return Ok(());
     }
     out.write_str("<ul class=\"small\">")?;
-    for shape in [Shape::Sharp, Shape::Round, Shape::Chamfer, Shape::Irregular] {
+    for shape in [
+        Shape::Sharp,
+        Shape::Round,
+        Shape::Chamfer,
+        Shape::Undecided,
+        Shape::Irregular,
+    ] {
         let of_shape: Vec<_> = edge.breaks.iter().filter(|b| b.shape == shape).collect();
         if of_shape.is_empty() {
             continue;
@@ -128,6 +138,16 @@ fn write_breaks(out: &mut String, edge: &Edge) -> fmt::Result {
                 let legs = of_shape.iter().filter_map(|b| b.chamfer_legs_mm);
                 let legs = legs.flatten().filter_map(|leg| leg.value);
                 format!("chamfer: legs {}", range(legs.collect()))
+            }
+            Shape::Undecided => {
+                let radii = of_shape.iter().filter_map(|b| b.radius_mm?.value);
+                let legs = of_shape.iter().filter_map(|b| b.chamfer_legs_mm);
+                let legs = legs.flatten().filter_map(|leg| leg.value);
+                format!(
+                    "broken, round or chamfer not to be told: radius {} or legs {}",
+                    range(radii.collect()),
+                    range(legs.collect())
+                )
             }
             Shape::Irregular => {
                 let burrs = of_shape.iter().filter_map(|b| b.burr_mm.value);
