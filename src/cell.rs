@@ -11,7 +11,7 @@ use acies_drivers::error::DeviceError;
 use acies_drivers::link::Links;
 use glam::DVec3;
 
-use crate::acquire::{Profiling, Scan, ScanError, ScanEvent, scan};
+use crate::acquire::{Carrier, Profiling, Scan, ScanError, ScanEvent, scan, scan_carried};
 use crate::config::{Cell, ProbeConfig};
 use crate::inspect::result::{Inspection, Verdict};
 use crate::inspect::{self, Recipe, Request, Start};
@@ -177,14 +177,19 @@ pub fn run(
 ) -> Result<Outcome, CellError> {
     let (nominal, recipe) = read_part(cell)?;
     let profilers = open_profilers(cell, links, watch)?;
+    let carrier = open_carrier(cell, links, watch)?;
     let (probes, touches) = touch_all(cell, links, watch)?;
     let began = Instant::now();
-    let (scan, profilers) = scan(profilers, cell.plan, &mut |event| {
+    let mut tell = |event| {
         watch(match event {
             ScanEvent::Progress { profiles, share } => State::Scanning { profiles, share },
             ScanEvent::Lost { device, error } => State::Lost { device, error },
         });
-    })?;
+    };
+    let (scan, profilers) = match carrier {
+        Some(carrier) => scan_carried(profilers, carrier, &mut tell)?,
+        None => scan(profilers, cell.plan, &mut tell)?,
+    };
     let scanned = Instant::now();
     drop(profilers);
     watch(State::Inspecting);
@@ -229,15 +234,9 @@ fn open_profilers(
 ) -> Result<Vec<Profiling>, CellError> {
     let mut opened = Vec::new();
     for config in &cell.profilers {
-        let Instrument::Profiler(profiler) = open(&config.name, &*config.setup, links, watch)?
-        else {
-            let device = config.name.clone();
-            return Err(CellError::Kind {
-                device,
-                found: "probe",
-                expected: "profiler",
-                table: "tip",
-            });
+        let profiler = match open(&config.name, &*config.setup, links, watch)? {
+            Instrument::Profiler(profiler) => profiler,
+            other => return Err(wrong_kind(&config.name, &other, "profiler")),
         };
         let (name, calibration) = (config.name.clone(), config.calibration);
         opened.push(Profiling {
@@ -247,6 +246,37 @@ fn open_profilers(
         });
     }
     Ok(opened)
+}
+
+fn open_carrier(
+    cell: &Cell,
+    links: &dyn Links,
+    watch: &mut dyn FnMut(State),
+) -> Result<Option<Carrier>, CellError> {
+    let Some(config) = &cell.carrier else {
+        return Ok(None);
+    };
+    match open(&config.name, &*config.setup, links, watch)? {
+        Instrument::Robot(robot) => Ok(Some(Carrier {
+            name: config.name.clone(),
+            robot,
+            plan: config.plan,
+        })),
+        other => Err(wrong_kind(&config.name, &other, "robot")),
+    }
+}
+
+fn wrong_kind(device: &str, found: &Instrument, expected: &'static str) -> CellError {
+    CellError::Kind {
+        device: device.to_owned(),
+        found: found.kind(),
+        expected,
+        table: match found {
+            Instrument::Profiler(_) => "calibration",
+            Instrument::Probe(_) => "tip",
+            Instrument::Robot(_) => "carrier",
+        },
+    }
 }
 
 /// The probes by name, and where they touched.
@@ -262,14 +292,9 @@ fn touch_all(
     let mut touched = Vec::new();
     let mut identities = Vec::new();
     for config in &cell.probes {
-        let Instrument::Probe(mut probe) = open(&config.name, &*config.setup, links, watch)? else {
-            let (device, table) = (config.name.clone(), "calibration");
-            return Err(CellError::Kind {
-                device,
-                found: "profiler",
-                expected: "probe",
-                table,
-            });
+        let mut probe = match open(&config.name, &*config.setup, links, watch)? {
+            Instrument::Probe(probe) => probe,
+            other => return Err(wrong_kind(&config.name, &other, "probe")),
         };
         for index in 0..config.touches.len() {
             watch(State::Touching {

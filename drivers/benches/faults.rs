@@ -122,6 +122,7 @@ fn outcome(bench: &Bench, case: &str) -> String {
         Instrument::Probe(probe) => (0..2)
             .find_map(|which| touch(probe.as_mut(), &cell, which).err())
             .map(|error| short(&text(&error))),
+        Instrument::Robot(_) => None,
         Instrument::Profiler(profiler) => {
             let mut told = profiler.start().err();
             let until = Instant::now() + Duration::from_secs(3);
@@ -144,7 +145,7 @@ fn outcome(bench: &Bench, case: &str) -> String {
                 l.received, l.lost_on_link, l.dropped_by_device, l.rejected
             )
         }
-        Instrument::Probe(_) => "touched".into(),
+        Instrument::Probe(_) | Instrument::Robot(_) => "touched".into(),
     };
     drop(instrument);
     // A damaged last command leaves a sensor without a keep-alive lit until somebody opens it again; pulled out, it is dark.

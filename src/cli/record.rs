@@ -8,7 +8,7 @@ use acies_drivers::link::cable::Cable;
 use acies_drivers::link::recording::Recorder;
 use anyhow::Context;
 
-use super::attached_device::{find, named, open, read_cell, run, summary};
+use super::attached_device::{find, named, open, read_cell, run, run_robot, summary};
 use super::{Failure, Status, print_line};
 
 /// Opens one device of a cell, runs it, and writes every byte that passes into a recording with its time.
@@ -55,6 +55,11 @@ impl Record {
                 let limit = Duration::from_secs_f64(self.seconds);
                 let run = run(profiler.as_mut(), self.profiles, limit, limit)?;
                 print_line(&summary(&run))?;
+            }
+            Instrument::Robot(mut robot) => {
+                print_line(&named(robot.identity()))?;
+                let limit = Duration::from_secs_f64(self.seconds);
+                print_line(&run_robot(robot.as_mut(), self.profiles, limit)?)?;
             }
             Instrument::Probe(probe) => print_line(&named(probe.identity()))?,
         }

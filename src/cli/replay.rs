@@ -7,7 +7,7 @@ use acies_drivers::device::Instrument;
 use acies_drivers::link::recording::Recording;
 use acies_drivers::link::replay::{Match, Replay};
 
-use super::attached_device::{find, named, open, read_cell, run, summary};
+use super::attached_device::{find, named, open, read_cell, run, run_robot, summary};
 use super::{Failure, Status, print_line};
 use crate::acquire::Assembler;
 use crate::points::write_scan;
@@ -56,6 +56,11 @@ impl ReplayCommand {
                     }
                     write_scan(path, &cloud).map_err(|error| Failure::Io(error.into()))?;
                 }
+            }
+            Instrument::Robot(mut robot) => {
+                print_line(&named(robot.identity()))?;
+                let hour = Duration::from_secs(3600);
+                print_line(&run_robot(robot.as_mut(), usize::MAX, hour)?)?;
             }
             Instrument::Probe(probe) => print_line(&named(probe.identity()))?,
         }

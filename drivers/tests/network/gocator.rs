@@ -21,7 +21,7 @@ fn start(setup: Setup) -> (SimulatedGocator, Box<dyn Profiler>) {
     );
     match open("gocator", &table) {
         Ok(Instrument::Profiler(profiler)) => (device, profiler),
-        Ok(Instrument::Probe(_)) => panic!("a probe"),
+        Ok(_) => panic!("no profiler"),
         Err(error) => panic!("{}", text(&error)),
     }
 }

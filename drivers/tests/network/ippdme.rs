@@ -39,7 +39,7 @@ fn table(device: &SimulatedCmm, more: &str) -> String {
 fn probe(device: &SimulatedCmm, more: &str) -> Box<dyn Probe> {
     match open("ippdme", &table(device, more)) {
         Ok(Instrument::Probe(probe)) => probe,
-        Ok(Instrument::Profiler(_)) => panic!("a profiler"),
+        Ok(_) => panic!("no probe"),
         Err(error) => panic!("{}", text(&error)),
     }
 }

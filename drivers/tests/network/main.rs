@@ -4,3 +4,4 @@ mod configs;
 mod gocator;
 mod ippdme;
 mod support;
+mod ur_rtde;

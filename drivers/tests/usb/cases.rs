@@ -129,7 +129,7 @@ fn text(error: &DeviceError) -> String {
 fn open_with(rig: &dyn Rig, driver: &str, table: &str) -> Result<Box<dyn Profiler>, DeviceError> {
     match setup(driver, table).open(rig.links())? {
         Instrument::Profiler(profiler) => Ok(profiler),
-        Instrument::Probe(_) => panic!("a probe"),
+        _ => panic!("no profiler"),
     }
 }
 
