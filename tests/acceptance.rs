@@ -161,10 +161,7 @@ fn known_errors_come_out_and_are_judged() {
         .lines()
         .find(|line| line.starts_with("distance "))
         .expect("the line");
-    assert!(
-        line.contains("+0.0") && line.contains("NOT OK"),
-        "{line}"
-    );
+    assert!(line.contains("+0.0") && line.contains("NOT OK"), "{line}");
     assert!(table.contains("no test to any of them") && table.contains("ISO 10360-102"));
 }
 

@@ -40,6 +40,9 @@ impl ReplayCommand {
         let device = find(&cell, self.device.as_deref())?;
         let recording =
             Recording::read(&self.recording).map_err(|error| Failure::BadInput(error.into()))?;
+        for note in recording.notes() {
+            print_line(&note)?;
+        }
         let links = Replay::new(recording, Match::Loose(PATIENCE));
         match open(&device, &links)? {
             Instrument::Profiler(mut profiler) => {

@@ -54,6 +54,7 @@ fn recording(columns: &[Option<DVec2>]) -> Recording {
     ];
     let record = |(i, (kind, bytes))| Record {
         kind,
+        channel: 0,
         time: Duration::from_millis(i),
         bytes,
     };
