@@ -164,6 +164,19 @@ pub trait Probe: Send {
         target_mm: [f64; 3],
         timeout: Duration,
     ) -> Result<Touch, crate::error::DeviceError>;
+    /// Scans from `start_mm` to `end_mm` along a line on a surface with the outward `normal`, a point every `step_mm`, in the order of the
+    /// scan. Machine axes, mm. Each point has the time at which it arrived: controllers tell none of their own.
+    ///
+    /// # Errors
+    /// As [`Probe::touch`]; [`crate::error::DeviceError::Lacks`] where the probe cannot scan.
+    fn scan_line(
+        &mut self,
+        start_mm: [f64; 3],
+        end_mm: [f64; 3],
+        normal: [f64; 3],
+        step_mm: f64,
+        timeout: Duration,
+    ) -> Result<Vec<Touch>, crate::error::DeviceError>;
 }
 
 /// An open robot that carries a profiler: a stream of poses.
