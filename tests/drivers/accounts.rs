@@ -183,10 +183,11 @@ struct Across {
     opened: Instant,
 }
 
-struct Open(Arc<Across>);
+/// Links to a desk.
+pub(crate) struct Open(Arc<Across>);
 
 /// Links that lead to a desk, whatever the target.
-pub fn across(desk: Desk) -> impl Links {
+pub(crate) fn across(desk: Desk) -> Open {
     let now = Instant::now();
     Open(Arc::new(Across {
         desk: Mutex::new(desk),
@@ -253,13 +254,9 @@ pub fn gauge(dialect: Dialect, faults: &str, seed: u64, time: Duration) -> Accou
     let table = toml::from_str(&table).expect("TOML");
     let driver = ALL.iter().find(|driver| driver.name == "serial-gauge");
     let setup = (driver.expect("the driver").configure)(table).expect("a configuration");
-    let now = Instant::now();
-    let across = Arc::new(Across {
-        desk: Mutex::new(desk),
-        began: now,
-        opened: now,
-    });
-    let opened = setup.open(&Open(Arc::clone(&across)));
+    let links = across(desk);
+    let across = Arc::clone(&links.0);
+    let opened = setup.open(&links);
     let Ok(Instrument::Profiler(mut gauge)) = opened else {
         return Account::default();
     };
