@@ -1,10 +1,12 @@
 //! Captures into a scan: calibration, encoder, poses, losses.
 //!
-//! A pose is joined by the encoder, never by the host's clock. What is lost stays a gap: nothing is interpolated across it.
+//! A pose is joined by the encoder, or by device time where a robot carries the profiler; never by the host's clock. What is lost
+//! stays a gap: nothing is interpolated across it.
 
 pub mod acceptance;
 mod assembler;
 pub mod calibrate;
+mod carried;
 pub mod clock;
 pub mod poses;
 mod run;
@@ -17,6 +19,7 @@ use crate::geometry::RigidTransform;
 use crate::points::PointCloud;
 
 pub use assembler::Assembler;
+pub use carried::{Carrier, CarrierPlan, scan_carried};
 pub use run::{Profiling, ScanError, ScanEvent, ScanPlan, ScanWatch, scan};
 
 /// Where a profiler is, and how it moves relative to the part.

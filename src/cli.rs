@@ -1,5 +1,6 @@
 //! The command line: one file a subcommand. Argument parsing only; the work is done by the modules above.
 
+mod acceptance;
 mod attached_device;
 mod backup;
 mod calibrate;
@@ -66,6 +67,8 @@ pub enum Command {
     Replay(replay::ReplayCommand),
     /// Find where a profiler stands from recordings of a reference sphere.
     Calibrate(calibrate::Calibrate),
+    /// Measure reference artefacts with a scanner: form, size, distance, flatness, edge; write a record.
+    Acceptance(acceptance::Acceptance),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
     /// Play one simulated device on a pseudo-terminal or a socket.
@@ -96,6 +99,7 @@ impl Command {
             Command::Record(command) => command.run(),
             Command::Replay(command) => command.run(),
             Command::Calibrate(command) => command.run(),
+            Command::Acceptance(command) => command.run(),
             Command::Devices(command) => command.run(),
             Command::Simulate(command) => command.run(),
         }

@@ -15,7 +15,7 @@ use acies_drivers::device::{Claim, Mistake, Setup};
 use acies_drivers::settings::Keys;
 use glam::DVec3;
 
-use crate::acquire::{Calibration, ScanPlan};
+use crate::acquire::{Calibration, CarrierPlan, ScanPlan};
 use crate::geometry::RigidTransform;
 pub use service::Service;
 use table::{Lines, calibrated, calibration, pose, vector};
@@ -23,8 +23,17 @@ use table::{Lines, calibrated, calibration, pose, vector};
 /// A profiler silent for this long has not reached the end of its scan: the slowest stages we know of trigger once a second.
 const SILENCE_S: f64 = 5.0;
 
+/// How near a robot must come to the end of its scan: more than its repeatability, less than any way.
+const WITHIN_MM: f64 = 1.0;
+
 /// Counts beyond which nobody's stage goes: a thousand kilometres at a micrometre a count.
 const COUNTS_MAX: i64 = 1_000_000_000_000;
+
+/// Of a cell without a stage.
+const NO_STAGE: ScanPlan = ScanPlan {
+    end_count: i64::MAX,
+    silence: Duration::from_secs(5),
+};
 
 /// A checked cell, ready to start.
 #[derive(Debug)]
@@ -37,8 +46,10 @@ pub struct Cell {
     pub recipe: Option<PathBuf>,
     /// Where the fixture holds the part; the true pose is found from the data.
     pub machine_from_part: RigidTransform,
-    /// When a scan ends.
+    /// When a scan by the stage ends.
     pub plan: ScanPlan,
+    /// The robot that carries the profilers, where one does; there is no stage then.
+    pub carrier: Option<CarrierConfig>,
     /// In the order of the file.
     pub profilers: Vec<ProfilerConfig>,
     /// In the order of the file.
@@ -75,6 +86,17 @@ impl Calibrated {
         let until = self.date.checked_add(self.valid?)?;
         (now > until).then_some(until)
     }
+}
+
+/// A checked robot that carries the profilers.
+#[derive(Debug)]
+pub struct CarrierConfig {
+    /// Used in reports.
+    pub name: String,
+    /// Ready to open.
+    pub setup: Box<dyn Setup>,
+    /// When a scan ends, and where the robot stands.
+    pub plan: CarrierPlan,
 }
 
 /// A checked probe.
@@ -217,6 +239,7 @@ struct Checker<'a> {
 enum DeviceConfig {
     Profiler(ProfilerConfig),
     Probe(ProbeConfig),
+    Carrier(CarrierConfig),
 }
 
 impl Checker<'_> {
@@ -242,25 +265,40 @@ impl Checker<'_> {
         let mut top = Keys::new(table);
         let name = top.needed("name", "a text", Keys::text);
         let part = top.needed("part", "a table [part]", Keys::table);
-        let stage = top.needed("stage", "a table [stage]", Keys::table);
         let devices = top.tables("device");
         let service = top.table("service");
+        let carried = devices.iter().any(|device| device.contains_key("carrier"));
+        let stage = match carried {
+            false => top.needed("stage", "a table [stage]", Keys::table),
+            true => {
+                if top.contains("stage") {
+                    top.wrong("stage", "a table", "none beside [device.carrier]");
+                }
+                top.table("stage").and(None)
+            }
+        };
         self.add_all(&[], "", problems(top));
         let (service, mistakes) = service::service(service, &|path| self.beside(path));
         self.add_all(&["service"], "service", mistakes);
         let part = part.and_then(|part| self.part(part));
-        let stage = stage.and_then(|stage| self.stage(stage));
+        let stage = match carried {
+            // The robot's own plan says when a scan ends.
+            true => Some((DVec3::ZERO, NO_STAGE)),
+            false => stage.and_then(|stage| self.stage(stage)),
+        };
         let travel_mm_per_count = stage.as_ref().map_or(DVec3::ZERO, |stage| stage.0);
         let mut profilers = Vec::new();
         let mut probes = Vec::new();
+        let mut carriers = Vec::new();
         for (index, device) in devices.into_iter().enumerate() {
             match self.device(index, device, travel_mm_per_count) {
                 Some(DeviceConfig::Profiler(profiler)) => profilers.push(profiler),
                 Some(DeviceConfig::Probe(probe)) => probes.push(probe),
+                Some(DeviceConfig::Carrier(carrier)) => carriers.push(carrier),
                 None => {}
             }
         }
-        self.names_and_claims(&profilers, &probes);
+        self.names_and_claims(&profilers, &probes, &carriers);
         if profilers.is_empty() && self.mistakes.is_empty() {
             self.add_at(
                 None,
@@ -279,6 +317,7 @@ impl Checker<'_> {
             recipe,
             machine_from_part,
             plan: stage?.1,
+            carrier: carriers.pop(),
             profilers,
             probes,
             service,
@@ -351,6 +390,7 @@ impl Checker<'_> {
             .contains("calibration")
             .then(|| calibration(&mut device, "calibration"));
         let tip = device.table("tip");
+        let carrier = device.table("carrier");
         let touches = device.tables("touch");
         let place = name
             .as_ref()
@@ -361,22 +401,31 @@ impl Checker<'_> {
         let at = ["device", number.as_str()];
         let (rest, mut mistakes) = device.into_rest();
         let setup = driver.and_then(|driver| self.setup(&driver, rest, &mut mistakes));
-        if calibration.is_some() == tip.is_some() {
-            let found = if tip.is_some() { "both" } else { "neither" };
+        let kinds = [calibration.is_some(), tip.is_some(), carrier.is_some()];
+        if kinds.iter().filter(|given| **given).count() != 1 {
+            let found = if kinds.contains(&true) {
+                "several"
+            } else {
+                "none"
+            };
             mistakes.push(mistake(
                 "calibration",
                 found,
-                "[device.calibration] for a profiler or [device.tip] for a probe",
+                "one of [device.calibration] for a profiler, [device.tip] for a probe, [device.carrier] for a robot",
             ));
         }
         self.add_all(&at, &place, mistakes);
         let tip = tip.and_then(|tip| self.tip(&at, &place, tip));
+        let carrier = carrier.and_then(|carrier| self.carrier(&at, &place, carrier));
         let touches = touches
             .into_iter()
             .enumerate()
             .filter_map(|(i, touch)| self.touch(&at, &place, i, touch));
         let touches: Vec<PlannedTouch> = touches.collect();
         let (name, setup) = (name?, setup?);
+        if let Some(plan) = carrier {
+            return Some(DeviceConfig::Carrier(CarrierConfig { name, setup, plan }));
+        }
         match (calibration, tip) {
             (Some(found), None) => {
                 let (machine_from_sensor, calibrated) = found?;
@@ -450,6 +499,28 @@ impl Checker<'_> {
         Some((radius_mm?, u_touch_mm?, calibrated))
     }
 
+    fn carrier(&mut self, at: &[&str], place: &str, table: toml::Table) -> Option<CarrierPlan> {
+        let mut carrier = Keys::new(table);
+        let base = carrier.needed(
+            "machine_from_base",
+            "a table [device.carrier.machine_from_base]",
+            pose,
+        );
+        let end_mm = vector(&mut carrier, "end_mm");
+        let within_mm = carrier.number("within_mm", 0.01..=100.0);
+        let lag_s = carrier.number("lag_s", -1.0..=1.0);
+        let silence_s = carrier.number("silence_s", 0.1..=600.0);
+        let path: Vec<&str> = at.iter().copied().chain(["carrier"]).collect();
+        self.add_all(&path, &format!("{place}, carrier"), problems(carrier));
+        Some(CarrierPlan {
+            machine_from_base: base?,
+            end_mm: end_mm?,
+            within_mm: within_mm.unwrap_or(WITHIN_MM),
+            lag_s: lag_s.unwrap_or(0.0),
+            silence: Duration::from_secs_f64(silence_s.unwrap_or(SILENCE_S)),
+        })
+    }
+
     fn touch(
         &mut self,
         at: &[&str],
@@ -484,9 +555,19 @@ impl Checker<'_> {
     }
 
     /// Names must differ, and no two devices may want the same thing.
-    fn names_and_claims(&mut self, profilers: &[ProfilerConfig], probes: &[ProbeConfig]) {
+    fn names_and_claims(
+        &mut self,
+        profilers: &[ProfilerConfig],
+        probes: &[ProbeConfig],
+        carriers: &[CarrierConfig],
+    ) {
         let devices = (profilers.iter().map(|p| (&p.name, &p.setup)))
-            .chain(probes.iter().map(|p| (&p.name, &p.setup)));
+            .chain(probes.iter().map(|p| (&p.name, &p.setup)))
+            .chain(carriers.iter().map(|c| (&c.name, &c.setup)));
+        if carriers.len() > 1 {
+            let found = format!("{} devices with [device.carrier]", carriers.len());
+            self.add_at(None, "device", mistake("carrier", &found, "one robot"));
+        }
         let mut names: BTreeMap<&str, usize> = BTreeMap::new();
         let mut claims: BTreeMap<Claim, Vec<String>> = BTreeMap::new();
         for (name, setup) in devices {

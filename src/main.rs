@@ -49,7 +49,9 @@ fn main() -> ExitCode {
     };
     // Under systemd the journal takes the fields as they are; elsewhere people read lines.
     let under_systemd = std::env::var_os("JOURNAL_STREAM").is_some();
-    let journal = under_systemd.then(tracing_journald::layer).and_then(Result::ok);
+    let journal = under_systemd
+        .then(tracing_journald::layer)
+        .and_then(Result::ok);
     let lines = journal.is_none().then(|| {
         tracing_subscriber::fmt::layer()
             .with_writer(std::io::stderr)

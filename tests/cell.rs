@@ -206,6 +206,17 @@ impl Probe for Device {
             host_time: Instant::now(),
         })
     }
+
+    fn scan_line(
+        &mut self,
+        _: [f64; 3],
+        _: [f64; 3],
+        _: [f64; 3],
+        _: f64,
+        _: Duration,
+    ) -> Result<Vec<Touch>, DeviceError> {
+        Ok(Vec::new())
+    }
 }
 
 /// A cell of two played profilers and a played probe in a folder of its own.

@@ -103,7 +103,7 @@ fn unknown_keys_wrong_units_and_wrong_types_are_told_together() {
         mistakes("together", &text),
         [
             "cell.toml: name: nothing, expected a text",
-            "cell.toml:1: nmae: an unknown key, expected one of name, part, stage, device",
+            "cell.toml:1: nmae: an unknown key, expected one of name, part, device, stage",
             "cell.toml:4: part: nominal: no file absent.step, expected a file that exists",
             "cell.toml:12: stage: end_count: \"60 mm\", expected a whole number of -1000000000000 to \
              1000000000000",
@@ -157,8 +157,8 @@ fn a_device_is_a_profiler_or_a_probe() {
     let told = mistakes("neither", &text);
     assert!(
         told.contains(
-            &"cell.toml:14: device \"left\": calibration: neither, expected [device.calibration] for a profiler or \
-              [device.tip] for a probe"
+            &"cell.toml:14: device \"left\": calibration: none, expected one of [device.calibration] for a profiler, \
+              [device.tip] for a probe, [device.carrier] for a robot"
                 .to_owned()
         ),
         "{told:?}"
@@ -174,6 +174,59 @@ fn a_device_is_a_profiler_or_a_probe() {
                 .collect::<Vec<_>>()
                 .join(", ")
         )
+    );
+}
+
+#[test]
+fn a_robot_takes_the_place_of_the_stage() {
+    let carried = SOUND.replace(
+        "[stage]\ntravel_mm_per_count = [0, 0.001, 0]\nend_count = 60000\n",
+        "",
+    ) + r#"
+[[device]]
+name = "arm"
+driver = "ur-rtde"
+address = "10.0.0.9"
+[device.carrier]
+end_mm = [1, 2, 3]
+[device.carrier.machine_from_base]
+origin_mm = [0, 0, 0]
+x_axis = [1, 0, 0]
+z_axis = [0, 0, 1]
+"#;
+    let cell = Cell::parse(&carried, &folder("carried")).expect("a sound cell");
+    let carrier = cell.carrier.expect("a carrier");
+    assert_eq!(
+        (carrier.name.as_str(), carrier.plan.within_mm),
+        ("arm", 1.0)
+    );
+    let both = carried.replace(
+        "[[device]]\nname = \"left\"",
+        "[stage]\nend_count = 1\n[[device]]\nname = \"left\"",
+    );
+    assert_eq!(
+        mistakes("carried-stage", &both),
+        ["cell.toml:11: stage: a table, expected none beside [device.carrier]"]
+    );
+    let bad = carried.replace("end_mm = [1, 2, 3]", "end = [1, 2, 3]\nlag_s = 3");
+    assert_eq!(
+        mistakes("carried-end", &bad),
+        [
+            "cell.toml:34: device \"arm\", carrier: end_mm: nothing, expected three numbers",
+            "cell.toml:36: device \"arm\", carrier: lag_s: 3, expected a number of -1 to 1",
+            "cell.toml:35: device \"arm\", carrier: end: an unknown key, expected one of machine_from_base, end_mm, \
+             within_mm, lag_s, silence_s",
+        ]
+    );
+    let two = carried.clone()
+        + &carried[carried
+            .find("[[device]]\nname = \"arm\"")
+            .expect("the robot")..]
+            .replace("arm", "other")
+            .replace("10.0.0.9", "10.0.0.10");
+    assert_eq!(
+        mistakes("carried-two", &two),
+        ["cell.toml: device: carrier: 2 devices with [device.carrier], expected one robot"]
     );
 }
 

@@ -31,7 +31,7 @@ use bench::{Bench, SOON, benches, by_port, open, port, text, touch};
 // ---- The table --------------------------------------------------------------------------------------------------------
 
 /// Drivers without a serial line: `drivers/tests/network` and `drivers/tests/usb` hold them to their simulators.
-const ELSEWHERE: [&str; 4] = ["gocator", "ippdme", "u3v-profiler", "usb-itn"];
+const ELSEWHERE: [&str; 5] = ["gocator", "ippdme", "u3v-profiler", "usb-itn", "ur-rtde"];
 
 #[test]
 fn the_table_of_drivers_is_sound() {
@@ -93,7 +93,7 @@ fn simulated_profiler(faults: &str, test: &str) -> (SimulatedProfiler, Box<dyn P
     let setup = profiler_bench().setup(&by_port(&port), "");
     match open(&*setup, &Cable) {
         Instrument::Profiler(profiler) => (device.expect("a simulated device"), profiler),
-        Instrument::Probe(_) => panic!("a probe"),
+        _ => panic!("no profiler"),
     }
 }
 
@@ -299,7 +299,7 @@ fn simulated_probe(
 fn probe(setup: &dyn Setup) -> Box<dyn Probe> {
     match open(setup, &Cable) {
         Instrument::Probe(probe) => probe,
-        Instrument::Profiler(_) => panic!("a profiler"),
+        _ => panic!("no probe"),
     }
 }
 

@@ -420,7 +420,12 @@ fn a_device_is_tried_by_hand_recorded_and_played_back() {
         &points.display().to_string(),
     ]);
     assert_eq!(status(&replayed), 0, "{}", text(&replayed.stderr));
-    let counted = |output: &str| output.lines().nth(1).map(str::to_owned);
+    let counts = |line: &&str| line.contains("lost on the link");
+    let counted = |output: &str| output.lines().find(counts).map(str::to_owned);
+    assert!(
+        text(&replayed.stdout).starts_with("recorded 20"),
+        "it says where it comes from"
+    );
     assert_eq!(
         counted(&text(&replayed.stdout)),
         counted(&said),

@@ -110,6 +110,7 @@ fn views() -> Vec<StoredView> {
             ),
             travel_mm_per_count: DVec3::new(0.0, 0.01, 1.0 / 3.0),
         },
+        carried: false,
     };
     vec![view("left"), view("right")]
 }

@@ -106,7 +106,7 @@ fn open(driver: &str, table: &str) -> Box<dyn Profiler> {
     let setup = (driver.configure)(table).unwrap_or_else(|mistakes| panic!("{mistakes:?}"));
     match setup.open(&Cable) {
         Ok(Instrument::Profiler(profiler)) => profiler,
-        Ok(Instrument::Probe(_)) => panic!("a probe"),
+        Ok(_) => panic!("no profiler"),
         Err(error) => panic!("{error}: {:?}", std::error::Error::source(&error)),
     }
 }

@@ -1,4 +1,4 @@
-//! What instruments deliver: profiles and touches, in the sensor's or the machine's own coordinates.
+//! What instruments deliver: profiles, touches and poses, in the sensor's or the machine's own coordinates.
 
 use std::time::Instant;
 
@@ -9,6 +9,8 @@ pub enum Capture {
     Profile(Profile),
     /// One contact of a probe.
     Touch(Touch),
+    /// Where a robot's tool was.
+    Pose(Pose),
 }
 
 /// One laser line: N columns in the plane of the sensor, in mm.
@@ -46,5 +48,18 @@ pub struct Touch {
     /// Unit direction of travel at contact, in the machine's axes: it points into the material.
     pub direction: [f64; 3],
     /// When the answer arrived.
+    pub host_time: Instant,
+}
+
+/// Where a robot's tool was at one moment of the robot's own clock, in the robot's base frame.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pose {
+    /// The robot's clock, raw, s since its controller was started.
+    pub device_time_s: f64,
+    /// Origin of the tool's frame, mm.
+    pub position_mm: [f64; 3],
+    /// Turn of the tool's frame: axis times angle, rad.
+    pub rotation: [f64; 3],
+    /// When the last byte arrived. Never used to find where the tool was, only to relate clocks.
     pub host_time: Instant,
 }

@@ -1,9 +1,9 @@
-//! The contract of a driver: find, configure and open are three acts; an open instrument is a profiler or a probe.
+//! The contract of a driver: find, configure and open are three acts; an open instrument is a profiler, a probe or a robot.
 
 use std::fmt;
 use std::time::{Duration, Instant};
 
-use crate::capture::{Profile, Touch};
+use crate::capture::{Pose, Profile, Touch};
 
 /// One family of instruments, before any of them is opened.
 pub struct Driver {
@@ -66,6 +66,28 @@ pub enum Instrument {
     Profiler(Box<dyn Profiler>),
     /// Touches where it is told.
     Probe(Box<dyn Probe>),
+    /// Says where its tool is; nothing here moves it.
+    Robot(Box<dyn Robot>),
+}
+
+impl Instrument {
+    /// Who it says it is.
+    pub fn identity(&self) -> &Identity {
+        match self {
+            Instrument::Profiler(profiler) => profiler.identity(),
+            Instrument::Probe(probe) => probe.identity(),
+            Instrument::Robot(robot) => robot.identity(),
+        }
+    }
+
+    /// The word for its kind.
+    pub fn kind(&self) -> &'static str {
+        match self {
+            Instrument::Profiler(_) => "profiler",
+            Instrument::Probe(_) => "probe",
+            Instrument::Robot(_) => "robot",
+        }
+    }
 }
 
 /// Who an instrument says it is.
@@ -142,4 +164,40 @@ pub trait Probe: Send {
         target_mm: [f64; 3],
         timeout: Duration,
     ) -> Result<Touch, crate::error::DeviceError>;
+    /// Scans from `start_mm` to `end_mm` along a line on a surface with the outward `normal`, a point every `step_mm`, in the order of the
+    /// scan. Machine axes, mm. Each point has the time at which it arrived: controllers tell none of their own.
+    ///
+    /// # Errors
+    /// As [`Probe::touch`]; [`crate::error::DeviceError::Lacks`] where the probe cannot scan.
+    fn scan_line(
+        &mut self,
+        start_mm: [f64; 3],
+        end_mm: [f64; 3],
+        normal: [f64; 3],
+        step_mm: f64,
+        timeout: Duration,
+    ) -> Result<Vec<Touch>, crate::error::DeviceError>;
+}
+
+/// An open robot that carries a profiler: a stream of poses.
+pub trait Robot: Send {
+    /// Who it says it is.
+    fn identity(&self) -> &Identity;
+    /// Starts the stream. The robot's motion is its own program's business.
+    ///
+    /// # Errors
+    /// When the robot refuses or does not answer.
+    fn start(&mut self) -> Result<(), crate::error::DeviceError>;
+    /// Waits for the next pose until `deadline`; `None` when it passed.
+    ///
+    /// # Errors
+    /// When the robot is gone or its stream ended by itself.
+    fn next(&mut self, deadline: Instant) -> Result<Option<Pose>, crate::error::DeviceError>;
+    /// Ends the stream. Poses still under way are returned.
+    ///
+    /// # Errors
+    /// When the robot does not confirm.
+    fn stop(&mut self) -> Result<Vec<Pose>, crate::error::DeviceError>;
+    /// Poses lost since [`Robot::start`], by the robot's own time.
+    fn losses(&self) -> Losses;
 }

@@ -479,7 +479,9 @@ impl Keeper {
     fn run(mut self) {
         let mut decoder = message::Decoder::default();
         let mut chunk = [0; 16 << 10];
-        let mut next_ping = Instant::now();
+        // The sensor begins to watch for pings with the first one. That comes behind the start of a run at once, so that a recording's
+        // order of commands is the same when it is played back.
+        let mut next_ping = Instant::now() + self.keepalive;
         loop {
             let inbox = self.shared.lock();
             if inbox.quit || inbox.over.is_some() {

@@ -687,6 +687,21 @@ impl Probe for GrblProbe {
             host_time,
         })
     }
+
+    fn scan_line(
+        &mut self,
+        _: [f64; 3],
+        _: [f64; 3],
+        _: [f64; 3],
+        _: f64,
+        _: Duration,
+    ) -> Result<Vec<Touch>, DeviceError> {
+        Err(DeviceError::Lacks {
+            port: self.controller.port.clone(),
+            capability: "scanning along a line",
+            key: "driver",
+        })
+    }
 }
 
 impl Drop for GrblProbe {

@@ -15,6 +15,7 @@
 //! tool = "Probe1"                 # changed to at opening, which moves the machine; without it the tool stays
 //! home = false                    # homes a machine that is not, which moves it; otherwise it is refused
 //! safe_z_mm = 150.0               # between touches the tip goes up to here, across, and down; without it, straight
+//! scan_order = "xyz"              # of the three numbers of a scan's point: servers differ
 //! set_search = true               # tells the server approach and search of every point; false leaves the server's
 //! ```
 
@@ -60,8 +61,18 @@ struct Settings {
     home: bool,
     safe_z_mm: Option<f64>,
     set_search: bool,
+    scan_order: [usize; 3],
 }
 
+/// Places of X, Y and Z among three numbers in that order.
+const ORDERS: [(&str, [usize; 3]); 6] = [
+    ("xyz", [0, 1, 2]),
+    ("xzy", [0, 2, 1]),
+    ("yxz", [1, 0, 2]),
+    ("yzx", [2, 0, 1]),
+    ("zxy", [1, 2, 0]),
+    ("zyx", [2, 1, 0]),
+];
 const REPORTS: [(&str, bool); 2] = [("tip-centre", false), ("surface", true)];
 
 fn configure(table: toml::Table) -> Configured {
@@ -95,6 +106,7 @@ fn configure(table: toml::Table) -> Configured {
     let home = keys.flag("home").unwrap_or(false);
     let safe_z_mm = keys.number("safe_z_mm", -1e5..=1e5);
     let set_search = keys.flag("set_search").unwrap_or(true);
+    let scan_order = keys.choice("scan_order", &ORDERS).unwrap_or([0, 1, 2]);
     keys.finish()?;
     let (Some((host, port)), Some(surface)) = (address, surface) else {
         // Without a mistake both are there: `finish` has returned otherwise.
@@ -115,6 +127,7 @@ fn configure(table: toml::Table) -> Configured {
         home,
         safe_z_mm,
         set_search,
+        scan_order,
     }))
 }
 
@@ -146,6 +159,7 @@ impl Setup for Settings {
             centre_above_mm: self.centre_above_mm,
             safe_z_mm: self.safe_z_mm,
             set_search: self.set_search,
+            scan_order: self.scan_order,
         })))
     }
 }
@@ -220,6 +234,7 @@ struct IppDme {
     centre_above_mm: f64,
     safe_z_mm: Option<f64>,
     set_search: bool,
+    scan_order: [usize; 3],
 }
 
 impl IppDme {
@@ -322,6 +337,44 @@ impl Probe for IppDme {
             direction,
             host_time: Instant::now(),
         })
+    }
+
+    fn scan_line(
+        &mut self,
+        start_mm: [f64; 3],
+        end_mm: [f64; 3],
+        normal: [f64; 3],
+        step_mm: f64,
+        timeout: Duration,
+    ) -> Result<Vec<Touch>, DeviceError> {
+        let long = length(normal);
+        let way_mm = length(std::array::from_fn(|i| end_mm[i] - start_mm[i]));
+        // `>` with a NaN is false, so that no number that is none passes.
+        if !(long > 1e-6 && way_mm > 1e-6 && step_mm > 1e-6 && (long + way_mm).is_finite()) {
+            return Err(DeviceError::Move {
+                port: self.port.clone(),
+                asked_mm: end_mm,
+                allowed: "a way, a normal and a step of some length, and finite".into(),
+            });
+        }
+        let normal = normal.map(|n| n / long);
+        // The server takes and reports what its points are: with "surface" the surface, otherwise the tip's centre.
+        let lowered =
+            |p: [f64; 3]| std::array::from_fn(|i| p[i] - self.centre_above_mm * normal[i]);
+        let (start, end) = (lowered(start_mm), lowered(end_mm));
+        let found = self
+            .session
+            .scan_line(start, end, normal, step_mm, self.scan_order, timeout);
+        let points = match found {
+            Ok(points) => points,
+            Err(error) => return Err(self.after_error(error)),
+        };
+        let touches = points.into_iter().map(|(point, host_time)| Touch {
+            tip_centre_mm: self.centre(point, normal, None),
+            direction: normal.map(|n| -n),
+            host_time,
+        });
+        Ok(touches.collect())
     }
 }
 

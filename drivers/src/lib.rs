@@ -1,4 +1,4 @@
-//! Line-laser profilers and touch probes: bytes to captures. A driver knows no geometry.
+//! Line-laser profilers, touch probes and robots: bytes to captures. A driver knows no geometry.
 //!
 //! In reading order: [`capture`] (what instruments deliver), [`device`] (the driver contract), [`link`] (bytes to and from a
 //! device, recorded and replayed), then one file a driver. To add one: write `<model>.rs`, add a line to [`ALL`].
@@ -21,6 +21,7 @@ pub mod rf60x;
 pub mod serial_gauge;
 pub mod settings;
 pub mod u3v_profiler;
+pub mod ur_rtde;
 pub mod usb_itn;
 
 /// Every driver, in the order shown to people.
@@ -34,4 +35,5 @@ pub static ALL: &[device::Driver] = &[
     ippdme::DRIVER,
     u3v_profiler::DRIVER,
     usb_itn::DRIVER,
+    ur_rtde::DRIVER,
 ];

@@ -37,6 +37,16 @@ pub trait Links: Send + Sync {
     }
 }
 
+impl<L: Links + ?Sized> Links for &L {
+    fn open(&self, target: &Target) -> Result<Arc<dyn Link>, LinkError> {
+        (**self).open(target)
+    }
+
+    fn open_usb(&self, target: &usb::UsbTarget) -> Result<Arc<dyn usb::UsbLink>, LinkError> {
+        (**self).open_usb(target)
+    }
+}
+
 /// An open link. One thread may read while another writes; dropping the last handle closes it.
 pub trait Link: Send + Sync {
     /// Reads what is there into `buffer`, waiting for the first byte until `deadline`.

@@ -218,7 +218,6 @@ struct UsbItn {
 /// A run that was started.
 #[derive(Clone, Copy)]
 struct Run {
-    began: Instant,
     next: Instant,
     /// Readings asked for.
     asked: u32,
@@ -278,7 +277,8 @@ impl UsbItn {
             sequence: run.asked - 1,
             boot: 0,
             // The tool has no clock: this is the host's, at the arrival of the reading.
-            device_time_ns: run.began.elapsed().as_nanos() as u64,
+            // It has no clock.
+            device_time_ns: 0,
             encoder: None,
             host_time: Instant::now(),
             dropped: 0,
@@ -306,7 +306,6 @@ impl Profiler for UsbItn {
         self.losses = Losses::default();
         let now = Instant::now();
         self.run = Some(Run {
-            began: now,
             next: now,
             asked: 0,
             pending: None,

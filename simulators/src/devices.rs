@@ -5,6 +5,9 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use glam::DVec3;
+
+use crate::carried::Motion;
 use crate::demo_cell::{DemoCell, DemoOptions, TIP_RADIUS_MM};
 use crate::faults::{FaultError, Faults};
 use crate::gauge::{self, Dialect};
@@ -14,8 +17,10 @@ use crate::ippdme::{self, SimulatedCmm};
 use crate::open_profile::SimulatedProfiler;
 use crate::optoncdt;
 use crate::point::SimulatedSensor;
+use crate::pose::Pose;
 use crate::rf60x;
 use crate::u3v;
+use crate::ur_rtde::{self, SimulatedRobot};
 use crate::usb::Socket;
 use crate::usb::preload::Carrier;
 use crate::usb_itn::InputTool;
@@ -31,7 +36,7 @@ pub struct Kind {
 }
 
 /// Every kind.
-pub const ALL: [Kind; 13] = [
+pub const ALL: [Kind; 14] = [
     Kind {
         name: "open-profile",
         summary: "line-laser profiler of the open-profile protocol, looking from the left",
@@ -84,6 +89,10 @@ pub const ALL: [Kind; 13] = [
         name: "usb-itn",
         summary: "Mitutoyo gauge on a USB-ITN",
     },
+    Kind {
+        name: "ur-rtde",
+        summary: "robot with an RTDE interface, its tool passing over the part once",
+    },
 ];
 
 /// Where a device is to appear.
@@ -112,6 +121,8 @@ pub enum Simulated {
     Cmm(SimulatedCmm, String),
     /// A USB device, and what to start a program with that is to see it.
     Usb(Usb, String),
+    /// A robot.
+    Robot(SimulatedRobot),
 }
 
 /// A USB device in a folder.
@@ -129,6 +140,7 @@ impl Simulated {
         match self {
             Simulated::Profiler(profiler) => profiler.port(),
             Simulated::Probe(probe) => probe.port(),
+            Simulated::Robot(robot) => robot.port(),
             Simulated::Sensor(sensor) => sensor.port(),
             Simulated::Gocator(_, port) | Simulated::Cmm(_, port) | Simulated::Usb(_, port) => port,
         }
@@ -199,7 +211,8 @@ pub fn start(name: &str, place: &Place, seed: u64, faults: &str) -> Result<Simul
         }
         ("gocator", Place::Tcp(address)) => start_gocator(&cell, *address),
         ("ippdme", Place::Tcp(address)) => start_cmm(&cell, *address),
-        ("gocator" | "ippdme", _) => {
+        ("ur-rtde", Place::Tcp(address)) => start_robot(*address, seed, &of_sensor),
+        ("gocator" | "ippdme" | "ur-rtde", _) => {
             return Err(refused(
                 name,
                 "somewhere else",
@@ -308,6 +321,18 @@ fn start_cmm(cell: &DemoCell, address: SocketAddr) -> io::Result<Simulated> {
     Ok(Simulated::Cmm(device, port))
 }
 
+/// The tool passes over the demo's part, at 50 mm/s, as soon as somebody listens.
+fn start_robot(address: SocketAddr, seed: u64, faults: &Faults) -> io::Result<Simulated> {
+    let down = Pose::turn_about(DVec3::ZERO, DVec3::X, std::f64::consts::PI);
+    let from = Pose::shift(DVec3::new(400.0, 100.0, 300.0)).after(down);
+    let motion = Motion::straight(from, DVec3::Y * 150.0, 50.0);
+    let setup = ur_rtde::Setup {
+        faults: faults.clone(),
+        ..ur_rtde::Setup::new(Arc::new(motion), seed)
+    };
+    SimulatedRobot::start(Wire::tcp(address)?, setup).map(Simulated::Robot)
+}
+
 fn start_usb(cell: &DemoCell, name: &str, folder: &Path) -> io::Result<Simulated> {
     let shown = |variables: [(&str, String); 2]| {
         let pairs = variables.map(|(name, value)| format!("{name}={value}"));
@@ -341,7 +366,7 @@ mod tests {
         assert_eq!(
             unknown,
             "simulator: no device is called \"toaster\", expected one of open-profile, open-profile-right, grbl-probe, \
-             optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac, keyence, gocator, ippdme, u3v-profiler, usb-itn"
+             optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac, keyence, gocator, ippdme, u3v-profiler, usb-itn, ur-rtde"
         );
         let fault = start("grbl-probe", &tcp, 1, "drop=x")
             .unwrap_err()

@@ -82,6 +82,8 @@ const ACK: u8 = 0x06;
 const NAK: u8 = 0x15;
 const XON: u8 = 0x11;
 const XOFF: u8 = 0x13;
+/// Code in the side log where a word stood in the place of the (first) value.
+pub const NO_VALUE: i64 = i64::MIN;
 /// Characters that an ND takes before it is full.
 const ND_BUFFER: usize = 100;
 
@@ -145,15 +147,16 @@ impl Gauge {
         ramp(self.readings + 50 * channel as u64, -20_000, 20_000, 400)
     }
 
-    /// A value as the device writes it, or a word in its place.
-    fn value(&mut self, channel: usize) -> String {
+    /// A value as the device writes it, or a word in its place; and whether it is a word.
+    fn value(&mut self, channel: usize) -> (String, bool) {
         let faults = &self.core.faults;
         let (sentinel, overrun) = (faults.sentinel, faults.overrun);
         let mm = self.reading(channel) as f64 / 1000.0;
         let value = if self.setup.inches { mm / 25.4 } else { mm };
         let absent = self.core.happens(sentinel);
         let over = self.core.happens(overrun);
-        match self.setup.dialect {
+        let dark = self.setup.dialect == Dialect::Keyence && !self.laser;
+        let text = match self.setup.dialect {
             Dialect::HeidenhainNd => {
                 let digits = if self.setup.inches { 5 } else { 4 };
                 nd_line(value, digits, self.setup.inches, absent || over)
@@ -166,23 +169,28 @@ impl Gauge {
             Dialect::Keyence if absent => "+EE.EEE".to_owned(),
             Dialect::Keyence if over || !self.laser => "-99.998".to_owned(),
             Dialect::Keyence => format!("{value:+07.3}"),
-        }
+        };
+        (text, absent || over || dark)
     }
 
     /// Answers a question for one reading, of one channel or of all.
     fn measure(&mut self, channel: usize, before: &str, now: Instant, out: &mut Outbox) {
-        let record = Record {
+        let mut record = Record {
             number: self.readings as u32,
             code: self.reading(channel),
             fate: Fate::Sent,
         };
-        let mut text = match self.setup.dialect {
+        let (mut text, word) = match self.setup.dialect {
             Dialect::Keyence => {
-                let values: Vec<String> = (0..self.setup.channels).map(|c| self.value(c)).collect();
-                format!("M0,{}\r\n", values.join(","))
+                let values = (0..self.setup.channels).map(|c| self.value(c));
+                let (values, words): (Vec<String>, Vec<bool>) = values.unzip();
+                (format!("M0,{}\r\n", values.join(",")), words[0])
             }
             _ => self.value(channel),
         };
+        if word {
+            record.code = NO_VALUE;
+        }
         text.insert_str(0, before);
         self.readings += 1;
         let faults = self.core.faults.clone();
@@ -296,12 +304,12 @@ impl Gauge {
             ["M0"] => return self.measure(0, "", now, out),
             ["MS"] => {
                 let values: Vec<String> = (0..self.setup.channels)
-                    .map(|c| format!("04,{}", self.value(c)))
+                    .map(|c| format!("04,{}", self.value(c).0))
                     .collect();
                 format!("MS,{}", values.join(","))
             }
             ["SR", id, "037" | "038"] if amplifier(id) => {
-                let value = self.value(id.parse().unwrap_or_default());
+                let (value, _) = self.value(id.parse().unwrap_or_default());
                 format!("{line},{value}")
             }
             ["SR", id, "050"] if amplifier(id) => format!("{line},{}", u8::from(!self.laser)),

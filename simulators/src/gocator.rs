@@ -14,6 +14,7 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use crate::carried::Motion;
 use crate::sensor::View;
 use crate::wire::lock;
 
@@ -24,6 +25,8 @@ pub enum Surface {
     View(Box<View>),
     /// A sine across and along, of so many points: cheap, for speed.
     Wave(u32),
+    /// A scene, from a tool that something carries; the view's `machine_from_sensor` is where the sensor is on the tool. Needs a rate.
+    Carried(Box<View>, Arc<Motion>),
 }
 
 /// What a profile message holds.

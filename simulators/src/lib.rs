@@ -23,6 +23,10 @@ pub mod wire;
 
 pub mod open_profile;
 
+pub mod carried;
+
+pub mod ur_rtde;
+
 pub mod gocator;
 
 pub mod ippdme;

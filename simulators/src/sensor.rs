@@ -152,25 +152,37 @@ impl View {
 
     /// Profile `index` of the traverse. The same seed and index give the same numbers, whatever was computed before.
     pub fn line(&self, index: u32) -> Line {
-        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
-        rng.set_stream(u64::from(index));
+        let mut rng = self.draws(index);
         let counts = self.position_counts(index, &mut rng);
         let travel = self.traverse.axis * (counts * self.traverse.mm_per_count);
-        let scene_from_sensor = self
-            .machine_from_scene
-            .inverse()
-            .after(Pose::shift(travel))
-            .after(self.machine_from_sensor);
+        let machine_from_sensor = Pose::shift(travel).after(self.machine_from_sensor);
+        self.seen_from(machine_from_sensor, counts.round() as i64, &mut rng)
+    }
+
+    /// Profile `index` from a sensor that something else carries; its encoder stands still.
+    pub fn line_from(&self, index: u32, machine_from_sensor: Pose) -> Line {
+        let mut rng = self.draws(index);
+        self.seen_from(machine_from_sensor, self.traverse.first_count, &mut rng)
+    }
+
+    fn draws(&self, index: u32) -> ChaCha8Rng {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(u64::from(index));
+        rng
+    }
+
+    fn seen_from(&self, machine_from_sensor: Pose, encoder: i64, rng: &mut ChaCha8Rng) -> Line {
+        let scene_from_sensor = self.machine_from_scene.inverse().after(machine_from_sensor);
         let n = self.columns as usize;
         let mut line = Line {
-            encoder: counts.round() as i64,
+            encoder,
             x_mm: Vec::with_capacity(n),
             z_mm: Vec::with_capacity(n),
             intensity: Vec::with_capacity(n),
             saturated: false,
         };
         for column in 0..self.columns {
-            self.column(column, &scene_from_sensor, &mut rng, &mut line);
+            self.column(column, &scene_from_sensor, rng, &mut line);
         }
         line
     }

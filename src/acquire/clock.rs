@@ -20,6 +20,11 @@ impl ClockFit {
         self.offset_s + self.rate * device_s
     }
 
+    /// Device time of a host time, s.
+    pub fn device(&self, host_s: f64) -> f64 {
+        (host_s - self.offset_s) / self.rate
+    }
+
     /// Drift in parts per million: plus = the device's clock is slow.
     pub fn drift_ppm(&self) -> f64 {
         1e6 * (self.rate - 1.0)

@@ -15,10 +15,10 @@ use crate::points::{Frame, PointCloud};
 
 /// Profiles that wait between a device and the assembly. When it is full the device's thread waits, the link pushes back,
 /// and what the device cannot keep it counts as dropped: nothing is lost silently.
-const QUEUE_PROFILES: usize = 64;
+pub(super) const QUEUE_PROFILES: usize = 64;
 
 /// How long one wait for a profile lasts before the thread looks whether it should stop.
-const POLL: Duration = Duration::from_millis(50);
+pub(super) const POLL: Duration = Duration::from_millis(50);
 
 /// One profiler of a scan.
 pub struct Profiling {
@@ -100,7 +100,7 @@ pub enum ScanError {
 }
 
 /// What a device's thread sends.
-enum Message {
+pub(super) enum Message {
     Profile(usize, Box<Profile>),
     Ended {
         view: usize,
@@ -160,14 +160,14 @@ pub fn scan(
     Ok((views.finish(&profilers), profilers))
 }
 
-fn stop_after_failure(profiling: &mut Profiling) {
+pub(super) fn stop_after_failure(profiling: &mut Profiling) {
     if let Err(error) = profiling.profiler.stop() {
         tracing::warn!(device = profiling.name, %error, "did not confirm its stop; its laser goes off by its own keep-alive");
     }
 }
 
 /// Reads one device until it is told that the view is done, it falls silent, or it is gone.
-fn deliver(
+pub(super) fn deliver(
     view: usize,
     profiler: &mut dyn Profiler,
     silence: Duration,
@@ -369,7 +369,7 @@ fn incomplete(device: &str, stood_at: Option<i64>, plan: ScanPlan) -> String {
     )
 }
 
-fn append(cloud: &mut PointCloud, view: PointCloud, index: u16) {
+pub(super) fn append(cloud: &mut PointCloud, view: PointCloud, index: u16) {
     cloud.positions.extend(view.positions);
     cloud.origins.extend(
         view.origins
@@ -383,7 +383,7 @@ fn append(cloud: &mut PointCloud, view: PointCloud, index: u16) {
 }
 
 /// An error with its causes, on one line.
-fn chain(error: &dyn std::error::Error) -> String {
+pub(super) fn chain(error: &dyn std::error::Error) -> String {
     let mut text = error.to_string();
     let mut cause = error.source();
     while let Some(inner) = cause {

@@ -13,8 +13,10 @@ use glam::DVec3;
 
 use super::CellError;
 use super::daemon::{Event, give_back};
-use super::devices::{Supervisor, chain, name_of};
-use super::job::{Acquired, Instruments, JobWatch, Step, acquire, as_probe, as_profiler, step_of};
+use super::devices::{self, Supervisor, chain, name_of};
+use super::job::{
+    Acquired, Instruments, JobWatch, Step, acquire, as_carrier, as_probe, as_profiler, step_of,
+};
 use super::live::Live;
 use crate::acquire::{Profiling, ScanEvent, ScanWatch};
 use crate::config::Cell;
@@ -78,6 +80,7 @@ fn work(acquisition: &Acquisition, writer: &mut Writer) -> Result<Acquired, Cell
             device: profiling.name.clone(),
             identity: profiling.profiler.identity().clone(),
             calibration: profiling.calibration,
+            carried: acquisition.cell.carrier.is_some(),
         })
         .collect();
     let names: Vec<String> = views.iter().map(|view| view.device.clone()).collect();
@@ -133,8 +136,10 @@ fn borrow(acquisition: &Acquisition) -> Result<Instruments, CellError> {
             reason: format!("device {:?} went away just now", name_of(cell, index)),
         });
     }
-    let probes = lent.split_off(cell.profilers.len().min(lent.len()));
+    let mut probes = lent.split_off(cell.profilers.len().min(lent.len()));
+    let robot = probes.split_off(cell.probes.len().min(probes.len()));
     let mut instruments = Instruments {
+        carrier: None,
         profilers: Vec::new(),
         probes: Vec::new(),
     };
@@ -148,6 +153,9 @@ fn borrow(acquisition: &Acquisition) -> Result<Instruments, CellError> {
     for (config, instrument) in cell.probes.iter().zip(probes.into_iter().flatten()) {
         let probe = as_probe(&config.name, instrument)?;
         instruments.probes.push((config.name.clone(), probe));
+    }
+    for (config, instrument) in cell.carrier.iter().zip(robot.into_iter().flatten()) {
+        instruments.carrier = Some(as_carrier(config, instrument)?);
     }
     Ok(instruments)
 }
@@ -166,6 +174,14 @@ fn return_all(acquisition: &Acquisition, instruments: Instruments, is_lost: &dyn
         give_back(
             &acquisition.supervisors,
             cell.profilers.len() + index,
+            instrument,
+        );
+    }
+    if let Some(carrier) = instruments.carrier {
+        let instrument = (!is_lost(&carrier.name)).then_some(Instrument::Robot(carrier.robot));
+        give_back(
+            &acquisition.supervisors,
+            devices::count(cell) - 1,
             instrument,
         );
     }

@@ -13,7 +13,7 @@ use acies_drivers::link::Links;
 use tokio::sync::{oneshot, watch};
 
 use super::acquisition::{Acquisition, acquire_for};
-use super::devices::{News, Supervisor, chain, name_of};
+use super::devices::{self, News, Supervisor, chain, name_of};
 use super::job::{Acquired, Part, Step, conclude, report_of};
 use super::live::Live;
 use super::recipes;
@@ -207,7 +207,7 @@ impl Daemon {
             limit: Some(1),
             ..Default::default()
         })?;
-        let devices = (0..cell.profilers.len() + cell.probes.len())
+        let devices = (0..devices::count(&cell))
             .map(|index| device_status(&cell, index, now))
             .collect();
         let live = Arc::new(Live::default());
@@ -1063,10 +1063,10 @@ fn compute(cell: &Cell, store: &Store, work: Work, simulated: bool) -> Result<In
 }
 
 fn device_status(cell: &Cell, index: usize, now: SystemTime) -> DeviceStatus {
-    let (kind, calibrated) = match index.checked_sub(cell.profilers.len()) {
-        None => ("profiler", cell.profilers[index].calibrated),
-        Some(probe) => ("probe", cell.probes[probe].calibrated),
-    };
+    let profilers = cell.profilers.iter().map(|p| ("profiler", p.calibrated));
+    let probes = cell.probes.iter().map(|p| ("probe", p.calibrated));
+    let mut all = profilers.chain(probes);
+    let (kind, calibrated) = all.nth(index).unwrap_or(("robot", None));
     let text = |time: SystemTime| humantime::format_rfc3339_seconds(time).to_string();
     let until = calibrated.and_then(|c| c.valid.map(|valid| c.date + valid));
     DeviceStatus {

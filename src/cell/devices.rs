@@ -94,19 +94,26 @@ impl Drop for Supervisor {
     }
 }
 
-/// The name of a cell's device by its index: profilers first, then probes.
+/// Devices of a cell, in the order of their indices: profilers, probes, the robot.
+pub(super) fn count(cell: &Cell) -> usize {
+    cell.profilers.len() + cell.probes.len() + usize::from(cell.carrier.is_some())
+}
+
+/// The name of a cell's device by its index.
 pub(super) fn name_of(cell: &Cell, index: usize) -> &str {
-    match index.checked_sub(cell.profilers.len()) {
-        None => &cell.profilers[index].name,
-        Some(probe) => &cell.probes[probe].name,
-    }
+    named(cell, index).0
 }
 
 fn setup_of(cell: &Cell, index: usize) -> &dyn Setup {
-    match index.checked_sub(cell.profilers.len()) {
-        None => &*cell.profilers[index].setup,
-        Some(probe) => &*cell.probes[probe].setup,
-    }
+    named(cell, index).1
+}
+
+fn named(cell: &Cell, index: usize) -> (&str, &dyn Setup) {
+    let profilers = cell.profilers.iter().map(|p| (p.name.as_str(), &*p.setup));
+    let probes = cell.probes.iter().map(|p| (p.name.as_str(), &*p.setup));
+    let carrier = cell.carrier.iter().map(|c| (c.name.as_str(), &*c.setup));
+    let mut all = profilers.chain(probes).chain(carrier);
+    all.nth(index).expect("an index below the count")
 }
 
 fn look_after(
@@ -122,7 +129,7 @@ fn look_after(
             Ok(instrument) => {
                 wait = WAIT_FIRST;
                 if !told_ready {
-                    tell(News::Ready(identity(&instrument)));
+                    tell(News::Ready(instrument.identity().clone()));
                     told_ready = true;
                 }
                 match keep(instrument, requests) {
@@ -191,13 +198,6 @@ fn pause(wait: Duration, requests: &Receiver<Request>) -> bool {
             Ok(Request::Retry) | Err(RecvTimeoutError::Timeout) => return true,
             Err(RecvTimeoutError::Disconnected) => return false,
         }
-    }
-}
-
-fn identity(instrument: &Instrument) -> Identity {
-    match instrument {
-        Instrument::Profiler(profiler) => profiler.identity().clone(),
-        Instrument::Probe(probe) => probe.identity().clone(),
     }
 }
 

@@ -5,13 +5,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use acies_drivers::capture::Touch;
-use acies_drivers::device::{Identity, Instrument, Probe, Setup};
+use acies_drivers::device::{Identity, Instrument, Probe, Profiler, Setup};
 use acies_drivers::link::Links;
 use glam::DVec3;
 
 use super::CellError;
-use crate::acquire::{Profiling, Scan, ScanEvent, ScanWatch, scan};
-use crate::config::{Cell, ProbeConfig};
+use crate::acquire::{Carrier, Profiling, Scan, ScanEvent, ScanWatch, scan, scan_carried};
+use crate::config::{CarrierConfig, Cell, ProbeConfig};
 use crate::inspect::result::{Inspection, Verdict};
 use crate::inspect::{self, Recipe, Request, Start};
 use crate::nominal::Nominal;
@@ -83,6 +83,7 @@ pub struct Outcome {
 
 /// The open devices of a job.
 pub(super) struct Instruments {
+    pub carrier: Option<Carrier>,
     pub profilers: Vec<Profiling>,
     pub probes: Vec<(String, Box<dyn Probe>)>,
 }
@@ -197,6 +198,7 @@ fn open_all(
     watch: &mut dyn FnMut(Step),
 ) -> Result<Instruments, CellError> {
     let mut instruments = Instruments {
+        carrier: None,
         profilers: Vec::new(),
         probes: Vec::new(),
     };
@@ -221,6 +223,9 @@ fn open_all(
         let probe = as_probe(&config.name, open(&config.name, &*config.setup)?)?;
         instruments.probes.push((config.name.clone(), probe));
     }
+    if let Some(config) = &cell.carrier {
+        instruments.carrier = Some(as_carrier(config, open(&config.name, &*config.setup)?)?);
+    }
     Ok(instruments)
 }
 
@@ -228,15 +233,10 @@ fn open_all(
 pub(super) fn as_profiler(
     device: &str,
     instrument: Instrument,
-) -> Result<Box<dyn acies_drivers::device::Profiler>, CellError> {
+) -> Result<Box<dyn Profiler>, CellError> {
     match instrument {
         Instrument::Profiler(profiler) => Ok(profiler),
-        Instrument::Probe(_) => Err(CellError::Kind {
-            device: device.to_owned(),
-            found: "probe",
-            expected: "profiler",
-            table: "tip",
-        }),
+        other => Err(wrong_kind(device, &other, "profiler")),
     }
 }
 
@@ -244,12 +244,35 @@ pub(super) fn as_profiler(
 pub(super) fn as_probe(device: &str, instrument: Instrument) -> Result<Box<dyn Probe>, CellError> {
     match instrument {
         Instrument::Probe(probe) => Ok(probe),
-        Instrument::Profiler(_) => Err(CellError::Kind {
-            device: device.to_owned(),
-            found: "profiler",
-            expected: "probe",
-            table: "calibration",
+        other => Err(wrong_kind(device, &other, "probe")),
+    }
+}
+
+/// The robot that an instrument is, as what carries the profilers.
+pub(super) fn as_carrier(
+    config: &CarrierConfig,
+    instrument: Instrument,
+) -> Result<Carrier, CellError> {
+    match instrument {
+        Instrument::Robot(robot) => Ok(Carrier {
+            name: config.name.clone(),
+            robot,
+            plan: config.plan,
         }),
+        other => Err(wrong_kind(&config.name, &other, "robot")),
+    }
+}
+
+fn wrong_kind(device: &str, found: &Instrument, expected: &'static str) -> CellError {
+    CellError::Kind {
+        device: device.to_owned(),
+        found: found.kind(),
+        expected,
+        table: match found {
+            Instrument::Profiler(_) => "calibration",
+            Instrument::Probe(_) => "tip",
+            Instrument::Robot(_) => "carrier",
+        },
     }
 }
 
@@ -268,7 +291,10 @@ pub(super) fn acquire(
     let probes = instruments.probes.iter().map(identity).collect();
     let began = Instant::now();
     let profilers = std::mem::take(&mut instruments.profilers);
-    let (scan, profilers) = scan(profilers, cell.plan, watch)?;
+    let (scan, profilers) = match &mut instruments.carrier {
+        Some(carrier) => scan_carried(profilers, carrier, watch)?,
+        None => scan(profilers, cell.plan, watch)?,
+    };
     let ended = Instant::now();
     instruments.profilers = profilers;
     Ok(Acquired {

@@ -70,7 +70,7 @@ pub enum DeviceState {
 pub struct DeviceStatus {
     /// Its name in the configuration.
     pub name: String,
-    /// `profiler` or `probe`.
+    /// `profiler`, `probe` or `robot`.
     pub kind: String,
     /// What it is doing.
     pub state: DeviceState,

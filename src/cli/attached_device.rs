@@ -4,7 +4,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use acies_drivers::capture::Profile;
-use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Setup};
+use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot, Setup};
 use acies_drivers::link::Links;
 use anyhow::anyhow;
 
@@ -16,7 +16,7 @@ use crate::config::Cell;
 pub struct Configured<'a> {
     /// Ready to open.
     pub setup: &'a dyn Setup,
-    /// Where a profiler is; `None` for a probe.
+    /// Where a profiler is; `None` for a probe or a robot.
     pub calibration: Option<Calibration>,
 }
 
@@ -41,7 +41,15 @@ pub fn find<'a>(cell: &'a Cell, name: Option<&str>) -> Result<Configured<'a>, Fa
         };
         (p.name.as_str(), configured)
     });
-    let mut all: Vec<(&str, Configured<'a>)> = profilers.chain(probes).collect();
+    let carriers = cell.carrier.iter().map(|c| {
+        let configured = Configured {
+            setup: &*c.setup,
+            calibration: None,
+        };
+        (c.name.as_str(), configured)
+    });
+    let all = profilers.chain(probes).chain(carriers);
+    let mut all: Vec<(&str, Configured<'a>)> = all.collect();
     let names: Vec<String> = all.iter().map(|(n, _)| format!("{n:?}")).collect();
     let place = match name {
         Some(name) => all.iter().position(|(n, _)| *n == name),
@@ -165,4 +173,46 @@ pub fn summary(run: &Run) -> String {
         lines.push(format!("ended early: {ended}"));
     }
     lines.join("\n")
+}
+
+/// Takes `count` poses, or as many as come in `limit`, and says what came.
+pub fn run_robot(robot: &mut dyn Robot, count: usize, limit: Duration) -> Result<String, Failure> {
+    let failed = |error: acies_drivers::error::DeviceError| Failure::Io(error.into());
+    robot.start().map_err(failed)?;
+    let until = Instant::now() + limit;
+    let mut poses = Vec::new();
+    let mut ended = None;
+    while poses.len() < count.min(PROFILES_MAX) && Instant::now() < until {
+        match robot.next(until) {
+            Ok(pose) => poses.extend(pose),
+            Err(error) => {
+                ended = Some(error.to_string());
+                break;
+            }
+        }
+    }
+    match robot.stop() {
+        Ok(under_way) => poses.extend(under_way),
+        Err(error) => ended = ended.or(Some(error.to_string())),
+    }
+    let Losses {
+        received,
+        lost_on_link,
+        rejected,
+        ..
+    } = robot.losses();
+    let mut lines = vec![format!(
+        "{received} poses; missing by the robot's clock {lost_on_link}, rejected {rejected}"
+    )];
+    if let [first, .., last] = &poses[..] {
+        let seconds = last.device_time_s - first.device_time_s;
+        let [x, y, z] = last.position_mm;
+        lines.push(format!(
+            "{seconds:.3} s by its clock; the tool is at {x:.3}, {y:.3}, {z:.3} mm"
+        ));
+    }
+    if let Some(ended) = ended {
+        lines.push(format!("ended early: {ended}"));
+    }
+    Ok(lines.join("\n"))
 }

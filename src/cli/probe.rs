@@ -7,7 +7,7 @@ use acies_drivers::device::Instrument;
 use acies_drivers::link::cable::Cable;
 use anyhow::anyhow;
 
-use super::attached_device::{find, named, open, read_cell, run, summary};
+use super::attached_device::{find, named, open, read_cell, run, run_robot, summary};
 use super::{Failure, Status, print_line};
 
 /// Opens one device of a cell, says who it is, and tries it: a profiler measures a few profiles, a probe touches once.
@@ -55,6 +55,10 @@ impl Probe {
                     let run = run(profiler.as_mut(), self.profiles, limit, limit)?;
                     print_line(&summary(&run))?;
                 }
+            }
+            Instrument::Robot(mut robot) => {
+                print_line(&named(robot.identity()))?;
+                print_line(&run_robot(robot.as_mut(), self.profiles, limit)?)?;
             }
             Instrument::Probe(mut probe) => {
                 print_line(&named(probe.identity()))?;

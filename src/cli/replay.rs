@@ -7,7 +7,7 @@ use acies_drivers::device::Instrument;
 use acies_drivers::link::recording::Recording;
 use acies_drivers::link::replay::{Match, Replay};
 
-use super::attached_device::{find, named, open, read_cell, run, summary};
+use super::attached_device::{find, named, open, read_cell, run, run_robot, summary};
 use super::{Failure, Status, print_line};
 use crate::acquire::Assembler;
 use crate::points::write_scan;
@@ -40,6 +40,9 @@ impl ReplayCommand {
         let device = find(&cell, self.device.as_deref())?;
         let recording =
             Recording::read(&self.recording).map_err(|error| Failure::BadInput(error.into()))?;
+        for note in recording.notes() {
+            print_line(&note)?;
+        }
         let links = Replay::new(recording, Match::Loose(PATIENCE));
         match open(&device, &links)? {
             Instrument::Profiler(mut profiler) => {
@@ -56,6 +59,11 @@ impl ReplayCommand {
                     }
                     write_scan(path, &cloud).map_err(|error| Failure::Io(error.into()))?;
                 }
+            }
+            Instrument::Robot(mut robot) => {
+                print_line(&named(robot.identity()))?;
+                let hour = Duration::from_secs(3600);
+                print_line(&run_robot(robot.as_mut(), usize::MAX, hour)?)?;
             }
             Instrument::Probe(probe) => print_line(&named(probe.identity()))?,
         }

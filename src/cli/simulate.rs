@@ -15,7 +15,7 @@ use super::{Failure, Status, print_line};
 #[command(after_help = AFTER)]
 pub struct Simulate {
     /// Which device: open-profile, open-profile-right, grbl-probe, optoncdt, rf60x, heidenhain-nd, mitutoyo, sylvac, keyence, gocator,
-    /// ippdme, u3v-profiler or usb-itn.
+    /// ippdme, u3v-profiler, usb-itn or ur-rtde.
     device: String,
     /// Path under which the pseudo-terminal appears.
     #[arg(long, value_name = "PATH", conflicts_with = "tcp")]

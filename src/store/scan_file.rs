@@ -64,6 +64,14 @@ pub enum ScanFileError {
         /// What belongs there.
         expected: &'static str,
     },
+    /// The points of a run by a robot.
+    #[error(
+        "{path}: a robot carried the profilers, and its poses are not in the file: the profiles can be read, the points cannot be placed again"
+    )]
+    Carried {
+        /// Which.
+        path: PathBuf,
+    },
 }
 
 /// One profiler of a stored run.
@@ -75,6 +83,8 @@ pub struct StoredView {
     pub identity: Identity,
     /// Where it was.
     pub calibration: Calibration,
+    /// Whether a robot carried it: the poses of a robot are not in the file.
+    pub carried: bool,
 }
 
 /// [`StoredView`] in JSON.
@@ -89,6 +99,8 @@ struct WireView {
     rotation: [f64; 4],
     translation_mm: [f64; 3],
     travel_mm_per_count: [f64; 3],
+    #[serde(default)]
+    carried: bool,
 }
 
 /// Writes the profiles of a run while it lasts.
@@ -329,6 +341,10 @@ impl ScanReader {
     /// # Errors
     /// As [`ScanReader::profiles`].
     pub fn into_cloud(mut self) -> Result<PointCloud, ScanFileError> {
+        if self.views.iter().any(|view| view.carried) {
+            let path = self.path;
+            return Err(ScanFileError::Carried { path });
+        }
         let views = self.views.iter();
         let mut assemblers: Vec<Assembler> = views
             .map(|view| Assembler::new(&view.device, view.calibration))
@@ -523,6 +539,7 @@ fn wire(view: &StoredView) -> WireView {
         rotation: pose.rotation.to_array(),
         translation_mm: pose.translation.to_array(),
         travel_mm_per_count: view.calibration.travel_mm_per_count.to_array(),
+        carried: view.carried,
     }
 }
 
@@ -542,5 +559,6 @@ fn unwire(wire: WireView) -> StoredView {
             },
             travel_mm_per_count: DVec3::from_array(wire.travel_mm_per_count),
         },
+        carried: wire.carried,
     }
 }

@@ -304,6 +304,11 @@ pub fn work(instrument: &mut Instrument, cell: &DemoCell) -> Result<(), DeviceEr
             profiler.stop().map(drop)
         }
         Instrument::Probe(probe) => touch(probe.as_mut(), cell, 0).map(drop),
+        Instrument::Robot(robot) => {
+            robot.start()?;
+            robot.next(Instant::now() + SOON)?;
+            robot.stop().map(drop)
+        }
     }
 }
 

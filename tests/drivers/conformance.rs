@@ -29,6 +29,7 @@ fn work_until_told(instrument: &mut Instrument, cell: &DemoCell, bench: &Bench) 
         let worked = match instrument {
             Instrument::Profiler(profiler) => profiler.next(deadline).map(drop),
             Instrument::Probe(probe) => touch(probe.as_mut(), cell, 0).map(drop),
+            Instrument::Robot(robot) => robot.next(deadline).map(drop),
         };
         if let Err(error) = worked {
             return error;
@@ -37,9 +38,12 @@ fn work_until_told(instrument: &mut Instrument, cell: &DemoCell, bench: &Bench) 
 }
 
 fn begin(instrument: &mut Instrument) {
-    if let Instrument::Profiler(profiler) = instrument
-        && let Err(error) = profiler.start()
-    {
+    let begun = match instrument {
+        Instrument::Profiler(profiler) => profiler.start(),
+        Instrument::Robot(robot) => robot.start(),
+        Instrument::Probe(_) => Ok(()),
+    };
+    if let Err(error) = begun {
         panic!("{}", text(&error));
     }
 }
@@ -56,10 +60,7 @@ fn each_opens_its_device_and_works() {
         let port = port("works", bench.name);
         assert_eq!(claims, [format!("port {}", port.display())]);
         let mut instrument = open(&*setup, &Cable);
-        let identity = match &instrument {
-            Instrument::Profiler(profiler) => profiler.identity(),
-            Instrument::Probe(probe) => probe.identity(),
-        };
+        let identity = instrument.identity();
         assert!(!identity.vendor.is_empty() && !identity.model.is_empty());
         // A device that can be told from another one says more.
         let told = !identity.serial.is_empty() || !identity.firmware.is_empty();

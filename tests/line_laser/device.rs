@@ -32,7 +32,7 @@ pub fn profiler(columns: &[Option<DVec2>]) -> Box<dyn Profiler> {
     let setup = (driver.configure)(table.parse().unwrap()).unwrap();
     match setup.open(&Replay::new(recording, Match::Exact)) {
         Ok(Instrument::Profiler(profiler)) => profiler,
-        Ok(Instrument::Probe(_)) => panic!("a probe"),
+        Ok(_) => panic!("no profiler"),
         Err(error) => panic!("{error}"),
     }
 }
@@ -54,6 +54,7 @@ fn recording(columns: &[Option<DVec2>]) -> Recording {
     ];
     let record = |(i, (kind, bytes))| Record {
         kind,
+        channel: 0,
         time: Duration::from_millis(i),
         bytes,
     };

@@ -53,6 +53,8 @@ struct Pending {
     command: String,
     acked: bool,
     data: Vec<Vec<Item>>,
+    /// When each of them was taken in.
+    arrived: Vec<Instant>,
     report: Option<Report>,
 }
 
@@ -89,6 +91,11 @@ impl Session {
         command: &str,
         patience: Duration,
     ) -> Result<Vec<Vec<Item>>, DeviceError> {
+        self.ask_whole(command, patience)
+            .map(|pending| pending.data)
+    }
+
+    fn ask_whole(&mut self, command: &str, patience: Duration) -> Result<Pending, DeviceError> {
         if self.lost || self.failed.is_some() {
             return Err(DeviceError::OutOfOrder {
                 port: self.port.clone(),
@@ -100,7 +107,7 @@ impl Session {
         let pending = self.transact(self.last_tag, command, patience)?;
         match pending.report {
             Some(report) => Err(self.refused(&pending.command, &report)),
-            None => Ok(pending.data),
+            None => Ok(pending),
         }
     }
 
@@ -208,7 +215,8 @@ impl Session {
 
     /// Scans from `start` to `end`, mm, along a line on a surface with the outward `normal`, a point every `step_mm`.
     ///
-    /// `order` says at which place of three numbers X, Y and Z stand: servers differ. Q is left out of the report.
+    /// `order` says at which place of three numbers X, Y and Z stand: servers differ. Q is left out of the report. With each point comes the
+    /// time at which its line arrived.
     ///
     /// # Errors
     /// As [`Session::ask`]; a line whose numbers are no whole number of points.
@@ -220,7 +228,7 @@ impl Session {
         step_mm: f64,
         order: [usize; 3],
         patience: Duration,
-    ) -> Result<Vec<[f64; 3]>, DeviceError> {
+    ) -> Result<Vec<([f64; 3], Instant)>, DeviceError> {
         self.ask("OnScanReport(X(), Y(), Z())", SHORT)?;
         let numbers: Vec<String> = [start, end, normal]
             .iter()
@@ -228,9 +236,9 @@ impl Session {
             .chain([&step_mm])
             .map(|n| decimal(*n))
             .collect();
-        let data = self.ask(&format!("ScanOnLine({})", numbers.join(",")), patience)?;
+        let scan = self.ask_whole(&format!("ScanOnLine({})", numbers.join(",")), patience)?;
         let mut points = Vec::new();
-        for items in &data {
+        for (items, at) in scan.data.iter().zip(&scan.arrived) {
             let numbers: Vec<f64> = items.iter().filter_map(number).collect();
             if numbers.len() != items.len() || !numbers.len().is_multiple_of(3) {
                 return Err(self.decode(DecodeError::Field {
@@ -240,7 +248,8 @@ impl Session {
                     allowed: "three for each point; another count is another scan report",
                 }));
             }
-            points.extend(numbers.chunks_exact(3).map(|p| order.map(|place| p[place])));
+            let placed = numbers.chunks_exact(3).map(|p| order.map(|place| p[place]));
+            points.extend(placed.map(|point| (point, *at)));
         }
         Ok(points)
     }
@@ -258,6 +267,7 @@ impl Session {
             command: command.to_owned(),
             acked: false,
             data: Vec::new(),
+            arrived: Vec::new(),
             report: None,
         };
         self.write(&format!("{} {command}\r\n", Tag::Command(tag)))?;
@@ -331,6 +341,7 @@ impl Session {
                         }));
                     }
                     pending.data.push(items);
+                    pending.arrived.push(Instant::now());
                 }
                 Kind::Error(report) => {
                     // An error may stand in place of the acknowledgement, and the end still follows.

@@ -2,20 +2,23 @@
 //!
 //! # The file
 //!
-//! Numbers are little-endian. The file begins with the eight bytes `ACIESREC`, the format version u32 (1), the length u32 of the
-//! target's name, that name in UTF-8, and the CRC-32C u32 of all that. Then follow records, each
+//! Numbers are little-endian. The file begins with the eight bytes `ACIESREC`, the format version u32 (1: one link; 2: several), the length
+//! u32 of the target's name, that name in UTF-8, and the CRC-32C u32 of all that. Then follow records, each
 //!
 //! | offset | size | field |
 //! |---|---|---|
-//! | 0 | 1 | kind: 0 bytes from the device, 1 bytes to the device, 2 the link was gone, 3 the recording reached its size limit |
-//! | 1 | 3 | 0 |
+//! | 0 | 1 | kind: 0 bytes from the device, 1 bytes to the device, 2 the link was gone, 3 the recording reached its size limit; in version 2 also 4 a channel is opened (its name in UTF-8), 5 a note on where the recording comes from (UTF-8), 6 a transfer failed (one byte: 1 stalled, 2 overflow), 7 a USB device's configuration descriptors |
+//! | 1 | 1 | channel; 0 in version 1 |
+//! | 2 | 2 | 0 |
 //! | 4 | 4 | length of the bytes, u32, at most 1 MiB |
 //! | 8 | 8 | time, u64, ns since the link was opened, never decreasing |
 //! | 16 | length | the bytes |
 //! | 16 + length | 4 | CRC-32C of the record up to here |
 //!
 //! Each record is one write to the file, so that a program that dies leaves at most one torn record at the end. The reader
-//! stops there and says so. The writer never makes the file longer than its limit; what passed after that is not in it.
+//! stops there and says so. A network device with several connections has a channel for each. Of a USB device every endpoint is a channel; a
+//! record from it is one transfer, so that short packets stay short; a request on the control endpoint is a record to it, its eight bytes of
+//! setup first, and what it brings a record from it. The writer never makes the file longer than its limit; what passed after that is not in it.
 
 use std::fs::File;
 use std::io::{self, Read, Write};
@@ -24,11 +27,14 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use super::usb::{self, Request, UsbInterface, UsbLink, UsbTarget};
 use super::{Link, Links, Target};
 use crate::error::LinkError;
 
 const MAGIC: &[u8; 8] = b"ACIESREC";
 const VERSION: u32 = 1;
+/// Of a file with several channels.
+const VERSION_OF_SEVERAL: u32 = 2;
 const RECORD_HEADER: usize = 16;
 /// Most bytes in one record; also bounds what a reader allocates for a lying length.
 const LENGTH_MAX: usize = 1 << 20;
@@ -60,7 +66,7 @@ pub enum RecordingError {
         found: String,
     },
     /// A format of another version.
-    #[error("{}: recording format {found}, this program reads {VERSION}; use the program that wrote it", path.display())]
+    #[error("{}: recording format {found}, this program reads {VERSION} and {VERSION_OF_SEVERAL}; use the program that wrote it", path.display())]
     Version {
         /// The file.
         path: PathBuf,
@@ -88,6 +94,14 @@ pub enum Kind {
     Gone,
     /// The recording reached its size limit; more passed than is in it.
     Limit,
+    /// A channel is opened; its name.
+    Opened,
+    /// Where the recording comes from.
+    Note,
+    /// A USB transfer failed.
+    Failed,
+    /// The configuration of a USB device, as its descriptors.
+    Configuration,
 }
 
 impl Kind {
@@ -97,13 +111,25 @@ impl Kind {
             Kind::ToDevice => 1,
             Kind::Gone => 2,
             Kind::Limit => 3,
+            Kind::Opened => 4,
+            Kind::Note => 5,
+            Kind::Failed => 6,
+            Kind::Configuration => 7,
         }
     }
 
     fn from_number(number: u8) -> Option<Kind> {
-        [Kind::FromDevice, Kind::ToDevice, Kind::Gone, Kind::Limit]
-            .into_iter()
-            .find(|kind| kind.number() == number)
+        let all = [
+            Kind::FromDevice,
+            Kind::ToDevice,
+            Kind::Gone,
+            Kind::Limit,
+            Kind::Opened,
+            Kind::Note,
+            Kind::Failed,
+            Kind::Configuration,
+        ];
+        all.into_iter().find(|kind| kind.number() == number)
     }
 }
 
@@ -112,6 +138,8 @@ impl Kind {
 pub struct Record {
     /// Direction, or what happened.
     pub kind: Kind,
+    /// Which of the links it passed over, from 0 in the order of their opening.
+    pub channel: u8,
     /// Time since the link was opened.
     pub time: Duration,
     /// The bytes that passed.
@@ -171,21 +199,35 @@ impl Recording {
 
     /// The recording as bytes of a file.
     pub fn encode(&self) -> Vec<u8> {
-        let mut bytes = encode_header(&self.target);
+        let several = |record: &Record| record.channel > 0 || record.kind.number() > 3;
+        let version = match self.records.iter().any(several) {
+            true => VERSION_OF_SEVERAL,
+            false => VERSION,
+        };
+        let mut bytes = encode_header(&self.target, version);
         for record in &self.records {
-            encode_record(&mut bytes, record.kind, record.time, &record.bytes);
+            let place = (record.kind, record.channel);
+            encode_record(&mut bytes, place, record.time, &record.bytes);
         }
         bytes
     }
+
+    /// Where it comes from, as was written down.
+    pub fn notes(&self) -> Vec<String> {
+        let notes = self.records.iter().filter(|r| r.kind == Kind::Note);
+        notes
+            .map(|r| String::from_utf8_lossy(&r.bytes).into_owned())
+            .collect()
+    }
 }
 
-fn encode_header(target: &str) -> Vec<u8> {
+fn encode_header(target: &str, version: u32) -> Vec<u8> {
     let mut end = target.len().min(NAME_MAX);
     while !target.is_char_boundary(end) {
         end -= 1;
     }
     let mut bytes = MAGIC.to_vec();
-    bytes.extend(VERSION.to_le_bytes());
+    bytes.extend(version.to_le_bytes());
     bytes.extend((end as u32).to_le_bytes());
     bytes.extend(&target.as_bytes()[..end]);
     let check = CRC.checksum(&bytes);
@@ -206,7 +248,7 @@ fn decode_header(bytes: &[u8], path: &Path) -> Result<(String, usize), Recording
         byte,
     };
     let found = u32_at(bytes, 8).ok_or_else(|| damaged(8))?;
-    if found != VERSION {
+    if ![VERSION, VERSION_OF_SEVERAL].contains(&found) {
         return Err(RecordingError::Version {
             path: path.into(),
             found,
@@ -225,9 +267,9 @@ fn decode_header(bytes: &[u8], path: &Path) -> Result<(String, usize), Recording
     Ok((target.into(), end + 4))
 }
 
-fn encode_record(into: &mut Vec<u8>, kind: Kind, time: Duration, bytes: &[u8]) {
+fn encode_record(into: &mut Vec<u8>, (kind, channel): (Kind, u8), time: Duration, bytes: &[u8]) {
     let start = into.len();
-    into.extend([kind.number(), 0, 0, 0]);
+    into.extend([kind.number(), channel, 0, 0]);
     into.extend((bytes.len() as u32).to_le_bytes());
     into.extend((time.as_nanos() as u64).to_le_bytes());
     into.extend(bytes);
@@ -239,7 +281,7 @@ fn encode_record(into: &mut Vec<u8>, kind: Kind, time: Duration, bytes: &[u8]) {
 fn decode_record(bytes: &[u8]) -> Option<(Record, usize)> {
     let kind = Kind::from_number(*bytes.first()?)?;
     let length = u32_at(bytes, 4)? as usize;
-    if bytes[1..4] != [0; 3] || length > LENGTH_MAX {
+    if *bytes.get(2..4)? != [0; 2] || length > LENGTH_MAX {
         return None;
     }
     let time = u64::from_le_bytes(bytes.get(8..16)?.try_into().ok()?);
@@ -250,6 +292,7 @@ fn decode_record(bytes: &[u8]) -> Option<(Record, usize)> {
     }
     let record = Record {
         kind,
+        channel: bytes[1],
         time: Duration::from_nanos(time),
         bytes: bytes[RECORD_HEADER..end].to_vec(),
     };
@@ -261,7 +304,7 @@ fn u32_at(bytes: &[u8], at: usize) -> Option<u32> {
     Some(u32::from_le_bytes(four.try_into().ok()?))
 }
 
-/// Opens links of `inner` and writes down what passes over each, one file a link.
+/// Opens links of `inner` and writes down what passes over them.
 ///
 /// A file that cannot be written ends the recording with one warning in the log, not the link.
 pub struct Recorder<L> {
@@ -269,23 +312,50 @@ pub struct Recorder<L> {
     folder: PathBuf,
     limit_bytes: u64,
     opened: AtomicU32,
+    /// The one file of all links, where there is only one.
+    whole: Option<Mutex<Whole>>,
 }
 
-impl<L: Links> Recorder<L> {
-    /// A recorder into `folder`, each file at most `limit_bytes` long.
+/// A file of several channels.
+struct Whole {
+    notes: Vec<String>,
+    tape: Option<Arc<Tape>>,
+    channels: u8,
+}
+
+impl<L> Recorder<L> {
+    /// A recorder into `folder`, one file a link, each at most `limit_bytes` long.
     pub fn new(inner: L, folder: impl Into<PathBuf>, limit_bytes: u64) -> Recorder<L> {
         Recorder {
             inner,
             folder: folder.into(),
             limit_bytes,
             opened: AtomicU32::new(0),
+            whole: None,
+        }
+    }
+
+    /// A recorder of one device, with all its links in one file, and where it comes from.
+    pub fn of_device(
+        inner: L,
+        folder: impl Into<PathBuf>,
+        limit_bytes: u64,
+        notes: Vec<String>,
+    ) -> Recorder<L> {
+        let whole = Whole {
+            notes,
+            tape: None,
+            channels: 0,
+        };
+        Recorder {
+            whole: Some(Mutex::new(whole)),
+            ..Recorder::new(inner, folder, limit_bytes)
         }
     }
 
     /// Creates the next file of this target that does not exist yet: `NAME-0.aciesrec`, `NAME-1.aciesrec`, …
-    fn create(&self, target: &Target) -> Result<(PathBuf, File), RecordingError> {
+    fn create(&self, target: &str) -> Result<(PathBuf, File), RecordingError> {
         let name: String = target
-            .to_string()
             .chars()
             .map(|c| if c.is_ascii_alphanumeric() { c } else { '_' })
             .collect();
@@ -306,21 +376,17 @@ impl<L: Links> Recorder<L> {
             }
         }
     }
-}
 
-impl<L: Links> Links for Recorder<L> {
-    fn open(&self, target: &Target) -> Result<Arc<dyn Link>, LinkError> {
-        let link = self.inner.open(target)?;
+    fn start(&self, target: &str, version: u32) -> Result<Arc<Tape>, RecordingError> {
         let (path, mut file) = self.create(target)?;
-        let header = encode_header(&target.to_string());
+        let header = encode_header(target, version);
         file.write_all(&header)
             .map_err(|source| RecordingError::File {
                 path: path.clone(),
                 action: "written",
                 source,
             })?;
-        Ok(Arc::new(Recorded {
-            link,
+        Ok(Arc::new(Tape {
             opened: Instant::now(),
             writer: Mutex::new(Writer {
                 path,
@@ -331,9 +397,69 @@ impl<L: Links> Links for Recorder<L> {
             }),
         }))
     }
+
+    /// Where the records of a link to `target` go: tape and channel. A link may take several channels, the first of which this is.
+    fn channel(&self, target: &str, width: u8) -> Result<(Arc<Tape>, u8), RecordingError> {
+        let Some(whole) = &self.whole else {
+            return Ok((self.start(target, VERSION)?, 0));
+        };
+        let mut whole = whole.lock().unwrap_or_else(PoisonError::into_inner);
+        let tape = match &whole.tape {
+            Some(tape) => Arc::clone(tape),
+            None => {
+                let tape = self.start(target, VERSION_OF_SEVERAL)?;
+                for note in &whole.notes {
+                    tape.put(Kind::Note, 0, note.as_bytes());
+                }
+                whole.tape = Some(Arc::clone(&tape));
+                tape
+            }
+        };
+        let channel = whole.channels;
+        // 250 openings of one device: those after that share the last channel, and the recording is of no use.
+        whole.channels = whole.channels.saturating_add(width);
+        tape.put(Kind::Opened, channel, target.as_bytes());
+        Ok((tape, channel))
+    }
 }
 
-/// The file of one link; `file` is `None` after the limit or a failure.
+impl<L: Links> Links for Recorder<L> {
+    fn open(&self, target: &Target) -> Result<Arc<dyn Link>, LinkError> {
+        let link = self.inner.open(target)?;
+        let (tape, channel) = self.channel(&target.to_string(), 1)?;
+        Ok(Arc::new(Recorded {
+            link,
+            tape,
+            channel,
+        }))
+    }
+
+    fn open_usb(&self, target: &UsbTarget) -> Result<Arc<dyn UsbLink>, LinkError> {
+        let link = self.inner.open_usb(target)?;
+        if self.whole.is_none() {
+            return Err(LinkError::NoUsb {
+                reason: "a recording of one link each holds no USB device".into(),
+            });
+        }
+        let endpoints = link.interfaces().iter().flat_map(|i| &i.endpoints);
+        let endpoints: Vec<u8> = endpoints.map(|e| e.address).collect();
+        let width = u8::try_from(1 + endpoints.len()).unwrap_or(u8::MAX);
+        let (tape, channel) = self.channel(&target.to_string(), width)?;
+        tape.put(
+            Kind::Configuration,
+            channel,
+            &usb::descriptors(link.interfaces()),
+        );
+        Ok(Arc::new(RecordedUsb {
+            link,
+            tape,
+            channel,
+            endpoints,
+        }))
+    }
+}
+
+/// A file; `file` is `None` after the limit or a failure.
 struct Writer {
     path: PathBuf,
     file: Option<File>,
@@ -346,21 +472,21 @@ impl Writer {
     /// Room that is always kept for the record that says that the limit was reached.
     const LAST: u64 = RECORD_HEADER as u64 + 4;
 
-    fn put(&mut self, kind: Kind, opened: Instant, bytes: &[u8]) {
+    fn put(&mut self, place: (Kind, u8), opened: Instant, bytes: &[u8]) {
         // The time is taken under the writer's lock, so that times in the file never decrease.
         let time = opened.elapsed();
         let Some(file) = &mut self.file else { return };
         self.scratch.clear();
         for part in bytes.chunks(LENGTH_MAX) {
-            encode_record(&mut self.scratch, kind, time, part);
+            encode_record(&mut self.scratch, place, time, part);
         }
         if bytes.is_empty() {
-            encode_record(&mut self.scratch, kind, time, bytes);
+            encode_record(&mut self.scratch, place, time, bytes);
         }
         let full = self.length + self.scratch.len() as u64 + Writer::LAST > self.limit_bytes;
         if full {
             self.scratch.clear();
-            encode_record(&mut self.scratch, Kind::Limit, time, &[]);
+            encode_record(&mut self.scratch, (Kind::Limit, 0), time, &[]);
         }
         self.length += self.scratch.len() as u64;
         match file.write_all(&self.scratch) {
@@ -377,17 +503,23 @@ impl Writer {
     }
 }
 
-struct Recorded {
-    link: Arc<dyn Link>,
+/// A file that several links write to.
+struct Tape {
     opened: Instant,
     writer: Mutex<Writer>,
 }
 
-impl Recorded {
-    fn put(&self, kind: Kind, bytes: &[u8]) {
+impl Tape {
+    fn put(&self, kind: Kind, channel: u8, bytes: &[u8]) {
         let mut writer = self.writer.lock().unwrap_or_else(PoisonError::into_inner);
-        writer.put(kind, self.opened, bytes);
+        writer.put((kind, channel), self.opened, bytes);
     }
+}
+
+struct Recorded {
+    link: Arc<dyn Link>,
+    tape: Arc<Tape>,
+    channel: u8,
 }
 
 impl Link for Recorded {
@@ -395,8 +527,8 @@ impl Link for Recorded {
         let answer = self.link.read(buffer, deadline);
         match &answer {
             Ok(0) => {}
-            Ok(n) => self.put(Kind::FromDevice, &buffer[..*n]),
-            Err(LinkError::Gone) => self.put(Kind::Gone, &[]),
+            Ok(n) => self.tape.put(Kind::FromDevice, self.channel, &buffer[..*n]),
+            Err(LinkError::Gone) => self.tape.put(Kind::Gone, self.channel, &[]),
             Err(_) => {}
         }
         answer
@@ -404,7 +536,108 @@ impl Link for Recorded {
 
     fn write(&self, bytes: &[u8], deadline: Instant) -> Result<(), LinkError> {
         // Written down before it is sent: the device may answer before this thread goes on.
-        self.put(Kind::ToDevice, bytes);
+        self.tape.put(Kind::ToDevice, self.channel, bytes);
         self.link.write(bytes, deadline)
+    }
+}
+
+/// Its control endpoint is the first channel, the others follow in the order of the descriptors.
+struct RecordedUsb {
+    link: Arc<dyn UsbLink>,
+    tape: Arc<Tape>,
+    channel: u8,
+    endpoints: Vec<u8>,
+}
+
+impl RecordedUsb {
+    fn channel_of(&self, endpoint: u8) -> u8 {
+        usb::channel_of(&self.endpoints, self.channel, endpoint)
+    }
+
+    /// Writes down what a transfer from the device brought.
+    fn note(&self, channel: u8, answer: &Result<Option<usize>, LinkError>, buffer: &[u8]) {
+        match answer {
+            Ok(Some(n)) => self.tape.put(Kind::FromDevice, channel, &buffer[..*n]),
+            Ok(None) => {}
+            Err(error) => self.note_failure(channel, error),
+        }
+    }
+
+    fn note_failure(&self, channel: u8, error: &LinkError) {
+        match error {
+            LinkError::Gone => self.tape.put(Kind::Gone, channel, &[]),
+            LinkError::Stalled => self.tape.put(Kind::Failed, channel, &[1]),
+            LinkError::Overflow => self.tape.put(Kind::Failed, channel, &[2]),
+            _ => {}
+        }
+    }
+}
+
+impl UsbLink for RecordedUsb {
+    fn interfaces(&self) -> &[UsbInterface] {
+        self.link.interfaces()
+    }
+
+    fn claim(&self, interface: u8) -> Result<(), LinkError> {
+        self.link.claim(interface)
+    }
+
+    fn control_in(
+        &self,
+        request: Request,
+        buffer: &mut [u8],
+        deadline: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        let setup = request.setup(buffer.len());
+        self.tape.put(Kind::ToDevice, self.channel, &setup);
+        let answer = self.link.control_in(request, buffer, deadline);
+        self.note(self.channel, &answer, buffer);
+        answer
+    }
+
+    fn control_out(
+        &self,
+        request: Request,
+        bytes: &[u8],
+        deadline: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        let mut setup = request.setup(bytes.len()).to_vec();
+        setup.extend(bytes);
+        self.tape.put(Kind::ToDevice, self.channel, &setup);
+        let answer = self.link.control_out(request, bytes, deadline);
+        if let Err(error) = &answer {
+            self.note_failure(self.channel, error);
+        }
+        answer
+    }
+
+    fn read(
+        &self,
+        endpoint: u8,
+        buffer: &mut [u8],
+        deadline: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        let answer = self.link.read(endpoint, buffer, deadline);
+        self.note(self.channel_of(endpoint), &answer, buffer);
+        answer
+    }
+
+    fn write(
+        &self,
+        endpoint: u8,
+        bytes: &[u8],
+        deadline: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        let channel = self.channel_of(endpoint);
+        self.tape.put(Kind::ToDevice, channel, bytes);
+        let answer = self.link.write(endpoint, bytes, deadline);
+        if let Err(error) = &answer {
+            self.note_failure(channel, error);
+        }
+        answer
+    }
+
+    fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError> {
+        self.link.clear_halt(endpoint)
     }
 }

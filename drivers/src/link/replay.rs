@@ -1,12 +1,14 @@
 //! Plays a recording back, as if the device were there.
 //!
 //! What the device sent after a command is not given out before the driver has written again, so that no answer comes
-//! before its question. How strictly the driver's own bytes are held to the recorded ones is [`Match`]'s choice.
+//! before its question. That holds across the links of one device: data wait for the command on another connection. How strictly the driver's own bytes are held to the recorded ones is [`Match`]'s choice.
 
-use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::recording::{Kind, Recording};
+use super::recording::{Kind, Record, Recording};
+use super::usb::{self, Request, UsbInterface, UsbLink, UsbTarget};
 use super::{Link, Links, Target, left};
 use crate::error::LinkError;
 
@@ -20,128 +22,223 @@ pub enum Match {
     Loose(Duration),
 }
 
-/// Opens one link only: a recording's. The target is not looked at.
+/// How long bytes of one channel wait for a recorded write on another, as data do for the start that was asked for on a control connection.
+/// Longer than any keep-alive's interval of ours, so that a start is never passed over while the caller still makes ready.
+const OTHERS_WRITE: Duration = Duration::from_secs(3);
+
+/// Opens the links of a recording, each once. A link is found by its target's name, or else the next in the order of opening is taken: a
+/// device may have another address than it had.
 pub struct Replay {
-    recording: Mutex<Option<Recording>>,
+    shared: Arc<Shared>,
+}
+
+struct Shared {
     matching: Match,
+    written: Condvar,
+    tape: Mutex<Tape>,
+}
+
+/// A recording, and how far it was played.
+struct Tape {
+    records: Vec<Record>,
+    /// For each record, how many recorded writes lie before it.
+    writes_before: Vec<usize>,
+    /// Indices of the recorded writes.
+    writes: Vec<usize>,
+    openings: Vec<Opening>,
+    channels: BTreeMap<u8, Cursor>,
+    /// Writes of the driver, and recorded ones that were passed over.
+    credit: usize,
+}
+
+/// A link that was opened when the recording was made.
+struct Opening {
+    channel: u8,
+    name: String,
+    interfaces: Option<Vec<UsbInterface>>,
+    taken: bool,
+}
+
+/// Records of one channel that come from the device, and what was given out of them.
+#[derive(Default)]
+struct Cursor {
+    records: VecDeque<usize>,
+    byte: usize,
 }
 
 impl Replay {
-    /// Plays `recording` to the first who opens a link; for everyone after that it is [`LinkError::Busy`].
+    /// Plays `recording` to those who open its links; for everyone after that it is [`LinkError::Busy`].
     pub fn new(recording: Recording, matching: Match) -> Replay {
         Replay {
-            recording: Mutex::new(Some(recording)),
-            matching,
+            shared: Arc::new(Shared {
+                matching,
+                written: Condvar::new(),
+                tape: Mutex::new(Tape::new(recording)),
+            }),
         }
     }
 }
 
 impl Links for Replay {
-    fn open(&self, _: &Target) -> Result<Arc<dyn Link>, LinkError> {
-        let mut slot = self
-            .recording
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        let recording = slot.take().ok_or(LinkError::Busy)?;
+    fn open(&self, target: &Target) -> Result<Arc<dyn Link>, LinkError> {
+        let opening = self.shared.lock().take(&target.to_string(), false)?;
         Ok(Arc::new(Played {
-            matching: self.matching,
-            written: Condvar::new(),
-            place: Mutex::new(Place {
-                recording,
-                record: 0,
-                byte: 0,
-                credit: 0,
-            }),
+            shared: Arc::clone(&self.shared),
+            channel: opening.0,
+        }))
+    }
+
+    fn open_usb(&self, target: &UsbTarget) -> Result<Arc<dyn UsbLink>, LinkError> {
+        let (channel, interfaces) = self.shared.lock().take(&target.to_string(), true)?;
+        let endpoints = interfaces.iter().flat_map(|i| &i.endpoints);
+        Ok(Arc::new(PlayedUsb {
+            shared: Arc::clone(&self.shared),
+            channel,
+            endpoints: endpoints.map(|e| e.address).collect(),
+            interfaces,
         }))
     }
 }
 
-struct Played {
-    matching: Match,
-    written: Condvar,
-    place: Mutex<Place>,
-}
-
-/// How far the recording was played.
-struct Place {
-    recording: Recording,
-    /// The record that is next.
-    record: usize,
-    /// Bytes of it that were given out.
-    byte: usize,
-    /// Writes of the driver that no recorded write has used up.
-    credit: usize,
-}
-
-impl Place {
-    fn next_kind(&self) -> Option<Kind> {
-        self.recording.records.get(self.record).map(|r| r.kind)
-    }
-
-    fn give(&mut self, buffer: &mut [u8]) -> usize {
-        let rest = &self.recording.records[self.record].bytes[self.byte..];
-        let n = rest.len().min(buffer.len());
-        buffer[..n].copy_from_slice(&rest[..n]);
-        self.byte += n;
-        if n == rest.len() {
-            self.record += 1;
-            self.byte = 0;
-        }
-        n
-    }
-
-    /// The next recorded write, which a write of the driver is held to.
-    fn recorded_write(&self) -> Option<usize> {
-        let later = self.recording.records[self.record..].iter();
-        later
-            .enumerate()
-            .find(|(_, record)| record.kind == Kind::ToDevice)
-            .map(|(offset, _)| self.record + offset)
-    }
-}
-
-impl Link for Played {
-    fn read(&self, buffer: &mut [u8], deadline: Instant) -> Result<usize, LinkError> {
-        let mut place = self.place.lock().unwrap_or_else(PoisonError::into_inner);
-        let patience = match self.matching {
-            Match::Exact => None,
-            Match::Loose(patience) => Some(Instant::now() + patience),
+impl Tape {
+    fn new(recording: Recording) -> Tape {
+        let mut tape = Tape {
+            records: recording.records,
+            writes_before: Vec::new(),
+            writes: Vec::new(),
+            openings: Vec::new(),
+            channels: BTreeMap::new(),
+            credit: 0,
         };
-        loop {
-            match place.next_kind() {
-                Some(Kind::FromDevice) => match place.give(buffer) {
-                    0 => {}
-                    n => return Ok(n),
-                },
-                Some(Kind::ToDevice) if place.credit > 0 => {
-                    place.credit -= 1;
-                    place.record += 1;
-                }
-                Some(Kind::ToDevice) if patience.is_some_and(|end| Instant::now() >= end) => {
-                    place.record += 1;
-                }
-                Some(Kind::ToDevice) => {
-                    let wait = left(patience.map_or(deadline, |end| end.min(deadline)));
-                    if left(deadline).is_zero() {
-                        return Ok(0);
+        for (i, record) in tape.records.iter().enumerate() {
+            tape.writes_before.push(tape.writes.len());
+            match record.kind {
+                Kind::ToDevice => tape.writes.push(i),
+                Kind::Opened => tape.openings.push(Opening {
+                    channel: record.channel,
+                    name: String::from_utf8_lossy(&record.bytes).into_owned(),
+                    interfaces: None,
+                    taken: false,
+                }),
+                Kind::Configuration => {
+                    if let Some(opening) = tape.openings.last_mut() {
+                        opening.interfaces = Some(usb::interfaces(&record.bytes));
                     }
-                    place = self
-                        .written
-                        .wait_timeout(place, wait)
-                        .unwrap_or_else(PoisonError::into_inner)
-                        .0;
                 }
-                Some(Kind::Gone | Kind::Limit) | None => return Err(LinkError::Gone),
+                Kind::Note => {}
+                Kind::FromDevice | Kind::Gone | Kind::Limit | Kind::Failed => {
+                    let cursor = tape.channels.entry(record.channel).or_default();
+                    cursor.records.push_back(i);
+                }
             }
         }
+        if tape.openings.is_empty() {
+            tape.openings.push(Opening {
+                channel: 0,
+                name: recording.target,
+                interfaces: None,
+                taken: false,
+            });
+        }
+        tape
     }
 
-    fn write(&self, bytes: &[u8], _: Instant) -> Result<(), LinkError> {
-        let mut place = self.place.lock().unwrap_or_else(PoisonError::into_inner);
+    fn take(&mut self, name: &str, usb: bool) -> Result<(u8, Vec<UsbInterface>), LinkError> {
+        let free = |opening: &Opening| !opening.taken && opening.interfaces.is_some() == usb;
+        let named = |opening: &Opening| free(opening) && opening.name == name;
+        let place = self.openings.iter().position(named);
+        let place = place.or_else(|| self.openings.iter().position(free));
+        let opening = &mut self.openings[place.ok_or(LinkError::Busy)?];
+        opening.taken = true;
+        Ok((
+            opening.channel,
+            opening.interfaces.clone().unwrap_or_default(),
+        ))
+    }
+
+    /// Nothing is left that any channel could give.
+    fn is_over(&self) -> bool {
+        self.channels.values().all(|cursor| {
+            let first = cursor.records.front();
+            first.is_none_or(|i| matches!(self.records[*i].kind, Kind::Gone | Kind::Limit))
+        })
+    }
+}
+
+/// What a channel gives next.
+enum Next {
+    /// The record with this index.
+    Record(usize),
+    /// Nothing before the deadline.
+    Nothing,
+    Over,
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, Tape> {
+        self.tape.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Waits until the next record of `channel` may be given out: no answer comes before its question.
+    fn next<'a>(
+        &'a self,
+        mut tape: MutexGuard<'a, Tape>,
+        channel: u8,
+        deadline: Instant,
+    ) -> (MutexGuard<'a, Tape>, Next) {
+        let began = Instant::now();
+        loop {
+            let first = tape.channels.get(&channel).and_then(|c| c.records.front());
+            let patience_until = match first.copied() {
+                Some(i) if tape.writes_before[i] <= tape.credit => {
+                    return match tape.records[i].kind {
+                        Kind::Gone | Kind::Limit => (tape, Next::Over),
+                        _ => (tape, Next::Record(i)),
+                    };
+                }
+                Some(i) => {
+                    let awaited = tape.writes[tape.credit];
+                    let own = tape.records[awaited].channel == channel;
+                    let patience = match self.matching {
+                        Match::Exact => None,
+                        Match::Loose(patience) if own => Some(patience),
+                        Match::Loose(patience) => Some(patience.max(OTHERS_WRITE)),
+                    };
+                    let until = patience.map(|patience| began + patience);
+                    if until.is_some_and(|until| Instant::now() >= until) {
+                        // Up to here, or to the next one of another channel.
+                        tape.credit = match own {
+                            true => tape.credit + 1,
+                            false => tape.writes_before[i],
+                        };
+                        self.written.notify_all();
+                        continue;
+                    }
+                    until
+                }
+                None if tape.is_over() => return (tape, Next::Over),
+                None => None,
+            };
+            if left(deadline).is_zero() {
+                return (tape, Next::Nothing);
+            }
+            let wait = left(patience_until.map_or(deadline, |until| until.min(deadline)));
+            // What other channels give out may be the last, and that wakes nobody.
+            let wait = wait.min(Duration::from_millis(20));
+            let waited = self.written.wait_timeout(tape, wait);
+            tape = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+    }
+
+    fn write(&self, channel: u8, bytes: &[u8]) -> Result<(), LinkError> {
+        let mut tape = self.lock();
         if self.matching == Match::Exact {
-            let at = place.recorded_write().ok_or(LinkError::Gone)?;
-            let record = &place.recording.records[at];
-            if place.credit > 0 || record.bytes != bytes {
+            let at = tape.writes.get(tape.credit).ok_or(LinkError::Gone)?;
+            let record = &tape.records[*at];
+            // What was recorded before it has been read.
+            let cursor = tape.channels.get(&record.channel);
+            let read = cursor.is_none_or(|c| c.records.front().is_none_or(|first| first > at));
+            if !read || record.bytes != bytes || record.channel != channel {
                 return Err(LinkError::Departed {
                     found: hex(bytes),
                     recorded: hex(&record.bytes),
@@ -149,8 +246,162 @@ impl Link for Played {
                 });
             }
         }
-        place.credit += 1;
+        tape.credit += 1;
         self.written.notify_all();
+        Ok(())
+    }
+}
+
+struct Played {
+    shared: Arc<Shared>,
+    channel: u8,
+}
+
+impl Link for Played {
+    fn read(&self, buffer: &mut [u8], deadline: Instant) -> Result<usize, LinkError> {
+        let mut tape = self.shared.lock();
+        loop {
+            let (mut held, next) = self.shared.next(tape, self.channel, deadline);
+            let i = match next {
+                Next::Record(i) => i,
+                Next::Nothing => return Ok(0),
+                Next::Over => return Err(LinkError::Gone),
+            };
+            let Tape {
+                records, channels, ..
+            } = &mut *held;
+            let cursor = channels.entry(self.channel).or_default();
+            let rest = records[i].bytes.get(cursor.byte..).unwrap_or_default();
+            let n = rest.len().min(buffer.len());
+            buffer[..n].copy_from_slice(&rest[..n]);
+            cursor.byte += n;
+            if n == rest.len() {
+                cursor.records.pop_front();
+                cursor.byte = 0;
+            }
+            if n > 0 {
+                return Ok(n);
+            }
+            tape = held;
+        }
+    }
+
+    fn write(&self, bytes: &[u8], _: Instant) -> Result<(), LinkError> {
+        self.shared.write(self.channel, bytes)
+    }
+}
+
+/// A USB device of a recording.
+struct PlayedUsb {
+    shared: Arc<Shared>,
+    channel: u8,
+    endpoints: Vec<u8>,
+    interfaces: Vec<UsbInterface>,
+}
+
+impl PlayedUsb {
+    /// The next transfer of a channel.
+    fn transfer(
+        &self,
+        channel: u8,
+        buffer: &mut [u8],
+        deadline: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        let (mut tape, next) = self.shared.next(self.shared.lock(), channel, deadline);
+        let i = match next {
+            Next::Record(i) => i,
+            Next::Nothing => return Ok(None),
+            Next::Over => return Err(LinkError::Gone),
+        };
+        tape.channels
+            .entry(channel)
+            .or_default()
+            .records
+            .pop_front();
+        let record = &tape.records[i];
+        match (record.kind, &record.bytes[..]) {
+            (Kind::Failed, [2]) => Err(LinkError::Overflow),
+            (Kind::Failed, _) => Err(LinkError::Stalled),
+            (_, bytes) if bytes.len() > buffer.len() => Err(LinkError::Overflow),
+            (_, bytes) => {
+                buffer[..bytes.len()].copy_from_slice(bytes);
+                Ok(Some(bytes.len()))
+            }
+        }
+    }
+
+    /// A transfer to the device, which may have failed when it was recorded.
+    fn send(&self, channel: u8, bytes: &[u8], length: usize) -> Result<Option<usize>, LinkError> {
+        self.shared.write(channel, bytes)?;
+        let mut tape = self.shared.lock();
+        let first = tape.channels.get(&channel).and_then(|c| c.records.front());
+        let failed = first.copied().filter(|i| {
+            tape.records[*i].kind == Kind::Failed && tape.writes_before[*i] == tape.credit
+        });
+        let Some(failed) = failed else {
+            return Ok(Some(length));
+        };
+        tape.channels
+            .entry(channel)
+            .or_default()
+            .records
+            .pop_front();
+        match tape.records[failed].bytes[..] {
+            [2] => Err(LinkError::Overflow),
+            _ => Err(LinkError::Stalled),
+        }
+    }
+
+    fn channel_of(&self, endpoint: u8) -> u8 {
+        usb::channel_of(&self.endpoints, self.channel, endpoint)
+    }
+}
+
+impl UsbLink for PlayedUsb {
+    fn interfaces(&self) -> &[UsbInterface] {
+        &self.interfaces
+    }
+
+    fn claim(&self, _: u8) -> Result<(), LinkError> {
+        Ok(())
+    }
+
+    fn control_in(
+        &self,
+        request: Request,
+        buffer: &mut [u8],
+        deadline: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        self.shared
+            .write(self.channel, &request.setup(buffer.len()))?;
+        self.transfer(self.channel, buffer, deadline)
+    }
+
+    fn control_out(
+        &self,
+        request: Request,
+        bytes: &[u8],
+        _: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        let mut setup = request.setup(bytes.len()).to_vec();
+        setup.extend(bytes);
+        self.send(self.channel, &setup, bytes.len())
+    }
+
+    fn read(
+        &self,
+        endpoint: u8,
+        buffer: &mut [u8],
+        deadline: Instant,
+    ) -> Result<Option<usize>, LinkError> {
+        self.transfer(self.channel_of(endpoint), buffer, deadline)
+    }
+
+    fn write(&self, endpoint: u8, bytes: &[u8], _: Instant) -> Result<Option<usize>, LinkError> {
+        self.send(self.channel_of(endpoint), bytes, bytes.len())
+    }
+
+    fn clear_halt(&self, _: u8) -> Result<(), LinkError> {
         Ok(())
     }
 }

@@ -125,6 +125,39 @@ pub struct Request {
     pub index: u16,
 }
 
+impl Request {
+    /// The eight bytes of the setup packet, for so many bytes of data.
+    pub fn setup(&self, length: usize) -> [u8; 8] {
+        let [v0, v1] = self.value.to_le_bytes();
+        let [i0, i1] = self.index.to_le_bytes();
+        let [l0, l1] = u16::try_from(length).unwrap_or(u16::MAX).to_le_bytes();
+        [self.kind, self.request, v0, v1, i0, i1, l0, l1]
+    }
+}
+
+/// Descriptors from which [`interfaces`] reads these again.
+pub(crate) fn descriptors(interfaces: &[UsbInterface]) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for interface in interfaces {
+        let [a, b, c] = interface.class;
+        // An interface has at most 30 endpoints.
+        let count = interface.endpoints.len() as u8;
+        bytes.extend([9, 4, interface.number, 0, count, a, b, c, 0]);
+        for endpoint in &interface.endpoints {
+            let [low, high] = endpoint.packet.to_le_bytes();
+            bytes.extend([7, 5, endpoint.address, endpoint.kind, low, high, 0]);
+        }
+    }
+    bytes
+}
+
+/// The channel of an endpoint in a recording whose control endpoint has `first`.
+pub(crate) fn channel_of(endpoints: &[u8], first: u8, endpoint: u8) -> u8 {
+    let place = endpoints.iter().position(|e| *e == endpoint);
+    let place = place.and_then(|place| u8::try_from(place + 1).ok());
+    first.saturating_add(place.unwrap_or(u8::MAX))
+}
+
 /// An open USB device. One thread may read an endpoint while others use others; dropping the last handle closes it.
 ///
 /// All transfers answer `None` when nothing passed before the deadline. `Some(0)` is a packet of no bytes.

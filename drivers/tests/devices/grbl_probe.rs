@@ -168,7 +168,7 @@ fn open(model: Model, table: &str) -> (Fake, Box<dyn Probe>) {
     let opened = setup("grbl-probe", table).open(&Wire(Arc::clone(&fake)));
     match opened {
         Ok(Instrument::Probe(probe)) => (fake, probe),
-        Ok(Instrument::Profiler(_)) => panic!("a profiler"),
+        Ok(_) => panic!("no probe"),
         Err(error) => panic!("{}", text(&error)),
     }
 }

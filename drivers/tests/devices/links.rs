@@ -299,8 +299,8 @@ fn bad_recordings_say_what_is_wrong() {
         "x.aciesrec: begins with \"PK\\u{3}\\u{4} som\", a recording begins with \"ACIESREC\""
     );
     assert_eq!(
-        told(b"ACIESREC\x02\0\0\0\0\0\0\0"),
-        "x.aciesrec: recording format 2, this program reads 1; use the program that wrote it"
+        told(b"ACIESREC\x03\0\0\0\0\0\0\0"),
+        "x.aciesrec: recording format 3, this program reads 1 and 2; use the program that wrote it"
     );
     assert_eq!(
         told(b"ACIESREC\x01\0\0\0\xFF\xFF\xFF\xFF"),
@@ -379,6 +379,7 @@ fn an_exact_replay_refuses_another_write() {
 fn a_loose_replay_passes_over_writes_that_do_not_come() {
     let record = |kind, bytes: &[u8]| Record {
         kind,
+        channel: 0,
         time: Duration::ZERO,
         bytes: bytes.into(),
     };

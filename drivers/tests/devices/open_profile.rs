@@ -178,7 +178,7 @@ fn open(fake: &Fake, table: &str) -> Box<dyn Profiler> {
     let opened = setup("open-profile", table).open(&Wire(Arc::clone(fake)));
     match opened {
         Ok(Instrument::Profiler(profiler)) => profiler,
-        Ok(Instrument::Probe(_)) => panic!("a probe"),
+        Ok(_) => panic!("no profiler"),
         Err(error) => panic!("{}", text(&error)),
     }
 }

@@ -3,11 +3,15 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use acies_drivers::device::Instrument;
 use acies_drivers::link::cable::Cable;
+use acies_simulators::carried::Motion;
 use acies_simulators::demo_cell::{DemoCell, TIP_RADIUS_MM};
 use acies_simulators::gocator::{Setup, SimulatedGocator, Surface};
 use acies_simulators::ippdme::{self, SimulatedCmm};
+use acies_simulators::pose::Pose;
+use acies_simulators::ur_rtde::{self, SimulatedRobot};
+use acies_simulators::wire::Wire;
+use glam::DVec3;
 
 use crate::support::{setup, text};
 
@@ -17,7 +21,7 @@ fn devices(cell: &str) -> Vec<(String, toml::Table)> {
     let read = std::fs::read_to_string(path).expect("an example cell");
     let table: toml::Table = read.parse().expect("TOML");
     let devices = table["device"].as_array().expect("devices");
-    let own = ["name", "driver", "calibration", "tip", "touch"];
+    let own = ["name", "driver", "calibration", "tip", "touch", "carrier"];
     devices
         .iter()
         .map(|device| {
@@ -33,8 +37,13 @@ fn identity(driver: &str, device: &toml::Table) -> String {
     let setup =
         setup(driver, &device.to_string()).unwrap_or_else(|mistakes| panic!("{mistakes:?}"));
     match setup.open(&Cable) {
-        Ok(Instrument::Profiler(profiler)) => profiler.identity().serial.clone(),
-        Ok(Instrument::Probe(probe)) => probe.identity().model.clone(),
+        Ok(instrument) => {
+            let identity = instrument.identity();
+            match identity.serial.is_empty() {
+                true => identity.model.clone(),
+                false => identity.serial.clone(),
+            }
+        }
         Err(error) => panic!("{}", text(&error)),
     }
 }
@@ -49,16 +58,27 @@ fn each_example_opens_its_device() {
         TIP_RADIUS_MM,
     );
     let cmm = SimulatedCmm::start(cmm).expect("a machine");
+    let motion = Motion::straight(Pose::IDENTITY, DVec3::X, 1.0);
+    let wire = Wire::tcp("127.0.0.1:0".parse().expect("an address")).expect("a socket");
+    let robot = SimulatedRobot::start(wire, ur_rtde::Setup::new(Arc::new(motion), 1));
+    let robot = robot.expect("a robot");
     let mut opened = Vec::new();
-    for cell in ["gocator", "ippdme"] {
+    for cell in ["gocator", "ippdme", "ur-rtde"] {
         for (driver, mut device) in devices(cell) {
             if driver == "gocator" {
                 device.extend(sensor.keys().parse::<toml::Table>().expect("keys"));
             } else {
-                device.insert("address".into(), cmm.address().to_string().into());
+                let address = match driver.as_str() {
+                    "ur-rtde" => robot.port().to_owned(),
+                    _ => cmm.address().to_string(),
+                };
+                device.insert("address".into(), address.into());
             }
             opened.push(identity(&driver, &device));
         }
     }
-    assert_eq!(opened, ["13434", "13434", "CartCMM"]);
+    assert_eq!(
+        opened,
+        ["13434", "13434", "CartCMM", "e-Series or later", "13434"]
+    );
 }

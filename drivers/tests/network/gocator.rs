@@ -1,11 +1,15 @@
 //! The Gocator driver against its simulated sensor.
 
 use std::collections::BTreeSet;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use acies_drivers::capture::Profile;
 use acies_drivers::device::{Instrument, Profiler};
 use acies_drivers::error::DeviceError;
+use acies_drivers::link::Links;
+use acies_drivers::link::cable::Cable;
+use acies_drivers::link::recording::{Recorder, Recording};
+use acies_drivers::link::replay::{Match, Replay};
 use acies_simulators::demo_cell::DemoCell;
 use acies_simulators::gocator::{Form, Misdeeds, Setup, SimulatedGocator, Surface};
 
@@ -21,7 +25,7 @@ fn start(setup: Setup) -> (SimulatedGocator, Box<dyn Profiler>) {
     );
     match open("gocator", &table) {
         Ok(Instrument::Profiler(profiler)) => (device, profiler),
-        Ok(Instrument::Probe(_)) => panic!("a probe"),
+        Ok(_) => panic!("no profiler"),
         Err(error) => panic!("{}", text(&error)),
     }
 }
@@ -349,4 +353,74 @@ fn every_mistake_of_a_table_is_told() {
             "port: an unknown key, expected one of address, data_port, health_port, serial_number, source, first_frame, flip_z, drops_indicator, protocol_version, keepalive_s",
         ]
     );
+}
+
+#[test]
+fn a_recording_of_all_three_channels_plays_back_the_same() {
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("gocator-recorded");
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let device = SimulatedGocator::start(Setup {
+        frames: 500,
+        ..wave(Misdeeds {
+            drop: 0.02,
+            lie: 0.02,
+            trigger_drops: 2,
+            ..Misdeeds::default()
+        })
+    });
+    let device = device.expect("a simulated sensor");
+    let table = format!("{}\nfirst_frame = 0\nkeepalive_s = 0.2", device.keys());
+    let taken = |links: &dyn Links, table: &str| {
+        let setup = setup("gocator", table).expect("a table");
+        let mut profiler = match setup.open(links) {
+            Ok(Instrument::Profiler(profiler)) => profiler,
+            Ok(_) => panic!("no profiler"),
+            Err(error) => panic!("{}", text(&error)),
+        };
+        profiler.start().expect("a start");
+        let mut profiles = Vec::new();
+        // The last frames may be among those that are lost.
+        while profiles.last().is_none_or(|p: &Profile| p.sequence < 480) {
+            let profile = profiler.next(Instant::now() + SOON);
+            let profile = profile.unwrap_or_else(|error| panic!("{}", text(&error)));
+            profiles.push(profile.expect("a profile in time"));
+        }
+        // Dropped triggers come by health, ten times a second; a replay gives them as they were.
+        let until = Instant::now() + SOON;
+        while profiler.losses().dropped_by_device < 1000 && Instant::now() < until {
+            profiles.extend(profiler.next(Instant::now()).expect("a link"));
+        }
+        profiles.extend(profiler.stop().expect("a stop"));
+        let identity = profiler.identity().clone();
+        let losses = profiler.losses();
+        let kept = profiles
+            .into_iter()
+            .map(|p| (p.sequence, p.device_time_ns, p.encoder, p.x_mm));
+        (identity, losses, kept.collect::<Vec<_>>())
+    };
+    let recorder = Recorder::of_device(Cable, &folder, 1 << 28, vec!["a note".into()]);
+    let live = taken(&recorder, &table);
+    assert!(
+        live.1.lost_on_link > 0 && live.1.dropped_by_device == 1000,
+        "{:?}",
+        live.1
+    );
+    let mut files = std::fs::read_dir(&folder).expect("the folder");
+    let file = files.next().expect("a recording").expect("an entry").path();
+    assert!(files.next().is_none(), "one file for all channels");
+    let recording = Recording::read(&file).expect("a recording");
+    let channels: BTreeSet<u8> = recording
+        .records
+        .iter()
+        .map(|record| record.channel)
+        .collect();
+    assert_eq!(channels, BTreeSet::from([0, 1, 2]));
+    // The device has moved to another address since.
+    let moved = "address = \"10.1.2.3\"\nfirst_frame = 0\nkeepalive_s = 0.2";
+    for table in [table.as_str(), moved] {
+        let links = Replay::new(recording.clone(), Match::Loose(Duration::from_millis(20)));
+        let replayed = taken(&links, table);
+        assert_eq!(live, replayed);
+    }
 }

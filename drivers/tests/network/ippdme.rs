@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use acies_drivers::device::{Instrument, Probe};
 use acies_drivers::ippdme::Session;
@@ -11,6 +11,7 @@ use acies_drivers::link::cable::Cable;
 use acies_drivers::link::{Links, Target};
 use acies_simulators::demo_cell::{DemoCell, TIP_RADIUS_MM};
 use acies_simulators::ippdme::{Misdeeds, Setup, SimulatedCmm};
+use glam::DVec3;
 
 use crate::support::{Hostile, SOON, open, refusal, setup, text};
 
@@ -39,7 +40,7 @@ fn table(device: &SimulatedCmm, more: &str) -> String {
 fn probe(device: &SimulatedCmm, more: &str) -> Box<dyn Probe> {
     match open("ippdme", &table(device, more)) {
         Ok(Instrument::Probe(probe)) => probe,
-        Ok(Instrument::Profiler(_)) => panic!("a profiler"),
+        Ok(_) => panic!("no probe"),
         Err(error) => panic!("{}", text(&error)),
     }
 }
@@ -281,11 +282,54 @@ fn sessions_scan_and_report_moves() {
             .scan_line(start, end, [0.0, 0.0, 1.0], 0.25, order, SOON)
             .expect("a scan");
         assert_eq!(points.len(), 41);
-        for (index, [x, y, z]) in points.into_iter().enumerate() {
+        assert!(points.is_sorted_by_key(|(_, at)| *at));
+        for (index, ([x, y, z], _)) in points.into_iter().enumerate() {
             assert!((x - (way.x + 0.25 * index as f64)).abs() < 2e-5);
             assert!((y - way.y).abs() < 2e-5);
             assert!((z - start[2]).abs() < 5.0, "{z}");
         }
+    }
+}
+
+#[test]
+fn a_probe_scans_along_a_line_in_whatever_order_its_server_writes() {
+    let cell = DemoCell::new(3);
+    let from_scene = cell.machine_from_part.inverse();
+    for (order, word) in [([0, 1, 2], "xyz"), ([2, 0, 1], "yzx")] {
+        let device = cmm(&cell, |setup| setup.scan_order = order);
+        let table = format!(
+            "address = \"{}\"\nreports = \"tip-centre\"\nscan_order = \"{word}\"",
+            device.address()
+        );
+        let Ok(Instrument::Probe(mut probe)) = open("ippdme", &table) else {
+            panic!("no probe");
+        };
+        let way = cell.touches[0].start;
+        let start = [way.x, way.y, way.z - 7.0];
+        let end = [way.x + 10.0, way.y, way.z - 7.0];
+        let began = Instant::now();
+        // A touch first, which tells the server how far from the surface to begin.
+        let target = [way.x, way.y, way.z - 40.0];
+        let touched = probe.touch(way.to_array(), target, SOON).expect("a touch");
+        let scan = probe
+            .scan_line(start, end, [0.0, 0.0, 2.0], 0.25, SOON)
+            .expect("a scan");
+        assert_eq!(scan.len(), 41);
+        for (index, point) in scan.iter().enumerate() {
+            let [x, y, z] = point.tip_centre_mm;
+            assert!((x - (way.x + 0.25 * index as f64)).abs() < 2e-5 && (y - way.y).abs() < 2e-5);
+            // The simulated server's scan reports where the axis through the tip meets the surface: the plate's top, plane in the part's
+            // frame, to its five digits.
+            let in_part = from_scene.point(DVec3::new(x, y, z));
+            let first = from_scene.point(DVec3::from(scan[0].tip_centre_mm));
+            assert!((in_part.z - first.z).abs() < 2e-5, "{in_part}");
+            assert_eq!(point.direction, [0.0, 0.0, -1.0]);
+        }
+        assert!(scan.is_sorted_by_key(|point| point.host_time) && scan[0].host_time > began);
+        let near = scan[0].tip_centre_mm[2] - touched.tip_centre_mm[2];
+        assert!(near.abs() < 2.0, "{near}");
+        let none = probe.scan_line(start, start, [0.0, 0.0, 1.0], 0.25, SOON);
+        assert!(none.is_err_and(|error| error.to_string().contains("a way, a normal and a step")));
     }
 }
 

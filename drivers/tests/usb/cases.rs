@@ -7,6 +7,9 @@ use acies_drivers::ALL;
 use acies_drivers::capture::Profile;
 use acies_drivers::device::{Instrument, Profiler, Setup};
 use acies_drivers::error::DeviceError;
+use acies_drivers::link::Links;
+use acies_drivers::link::recording::{Recorder, Recording};
+use acies_drivers::link::replay::{Match, Replay};
 use acies_simulators::demo_cell::DemoCell;
 use acies_simulators::sensor::View;
 use acies_simulators::u3v::{self, Misdeeds, Surface};
@@ -83,6 +86,11 @@ pub const CASES: &[Case] = &[
         run: itn_reads_a_gauge,
     },
     Case {
+        name: "a_recording_plays_back_the_same",
+        devices: recorded,
+        run: a_recording_plays_back_the_same,
+    },
+    Case {
         name: "itn_losses_are_exact",
         devices: bad_gauges,
         run: itn_losses_are_exact,
@@ -129,7 +137,7 @@ fn text(error: &DeviceError) -> String {
 fn open_with(rig: &dyn Rig, driver: &str, table: &str) -> Result<Box<dyn Profiler>, DeviceError> {
     match setup(driver, table).open(rig.links())? {
         Instrument::Profiler(profiler) => Ok(profiler),
-        Instrument::Probe(_) => panic!("a probe"),
+        _ => panic!("no profiler"),
     }
 }
 
@@ -537,6 +545,67 @@ fn itn_reads_a_gauge(rig: &dyn Rig, _: usize) {
         profiler.next(Instant::now() + SOON).expect("a link");
     }
     assert!(profiler.losses().received + profiler.losses().rejected > 0);
+}
+
+fn recorded() -> Vec<Device> {
+    vec![
+        wave(Misdeeds {
+            gap: 0.05,
+            ..Misdeeds::default()
+        }),
+        gauge(|_| ()),
+    ]
+}
+
+fn a_recording_plays_back_the_same(rig: &dyn Rig, which: usize) {
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("usb-recorded");
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let (setup, n) = match which {
+        0 => {
+            let table = format!("usb_serial = '{SERIAL}'\nfirst_block = 0");
+            (setup("u3v-profiler", &table), 100)
+        }
+        _ => (setup("usb-itn", "interval_s = 0.02"), 8),
+    };
+    let taken = |links: &dyn Links| {
+        let mut profiler = match setup.open(links) {
+            Ok(Instrument::Profiler(profiler)) => profiler,
+            Ok(_) => panic!("no profiler"),
+            Err(error) => panic!("{}", text(&error)),
+        };
+        profiler.start().expect("a start");
+        let mut profiles = Vec::new();
+        while profiles.len() < n {
+            let profile = profiler.next(Instant::now() + SOON);
+            let profile = profile.unwrap_or_else(|error| panic!("{}", text(&error)));
+            profiles.push(profile.expect("a profile in time"));
+        }
+        // What is under way at the stop differs from time to time.
+        let _ = profiler.stop();
+        let identity = profiler.identity().clone();
+        let kept = profiles
+            .into_iter()
+            .map(|p| (p.sequence, p.device_time_ns, p.x_mm, p.z_mm));
+        (identity, kept.collect::<Vec<_>>())
+    };
+    let note = "device 7 of the test".to_owned();
+    let recorder = Recorder::of_device(rig.links(), &folder, 1 << 28, vec![note.clone()]);
+    let live = taken(&recorder);
+    let mut files = std::fs::read_dir(&folder).expect("the folder");
+    let file = files.next().expect("a recording").expect("an entry").path();
+    assert!(files.next().is_none(), "one file for all endpoints");
+    let recording = Recording::read(&file).expect("a recording");
+    assert_eq!((recording.notes(), recording.torn_at), (vec![note], None));
+    assert_eq!(
+        Recording::decode(&recording.encode(), &file).expect("again"),
+        recording
+    );
+    let replayed = taken(&Replay::new(
+        recording,
+        Match::Loose(Duration::from_millis(20)),
+    ));
+    assert_eq!(live, replayed);
 }
 
 fn bad_gauges() -> Vec<Device> {

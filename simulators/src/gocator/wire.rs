@@ -173,7 +173,7 @@ impl Camera {
     pub fn new(setup: &Setup) -> Camera {
         let waves = match &setup.surface {
             Surface::Wave(columns) => (0..WAVES).map(|i| wave(*columns, i, setup.form)).collect(),
-            Surface::View(_) => Vec::new(),
+            Surface::View(_) | Surface::Carried(..) => Vec::new(),
         };
         Camera {
             rng: ChaCha8Rng::seed_from_u64(setup.seed),
@@ -215,7 +215,7 @@ impl Camera {
         let rows: Vec<Rows> = (first..first + batch)
             .map(|i| self.rows(setup, i))
             .collect();
-        let period_us = setup.rate_hz.map_or(200.0, |hz| 1e6 / hz);
+        let period_us = period_us(setup);
         if within(misdeeds.clock_back_at) {
             self.clock_us = 0;
         }
@@ -253,8 +253,22 @@ impl Camera {
                 rows
             }
             Surface::View(view) => rows_of(&view.line(index as u32), setup.form),
+            Surface::Carried(view, motion) => {
+                let since_s = index as f64 * period_us(setup) * 1e-6;
+                let machine_from_tool = motion.at(self.began + Duration::from_secs_f64(since_s));
+                let machine_from_sensor = machine_from_tool.after(view.machine_from_sensor);
+                rows_of(
+                    &view.line_from(index as u32, machine_from_sensor),
+                    setup.form,
+                )
+            }
         }
     }
+}
+
+/// From frame to frame.
+fn period_us(setup: &Setup) -> f64 {
+    setup.rate_hz.map_or(200.0, |hz| 1e6 / hz)
 }
 
 fn wave(columns: u32, phase: u64, form: Form) -> Rows {

@@ -1,0 +1,488 @@
+//! A scan by a robot: profiles and poses each by the clock of their own device, joined when the run is over.
+//!
+//! Neither clock is the host's, and no receipt is taken for a pose. Receipts only relate the clocks: the line under all of them
+//! ([`fit_clock`]) is the relation with the least delay. What it cannot tell is the difference of the two least delays; it moves all points
+//! of a view along the robot's path by one and the same time. A network's are some tens of microseconds, that of a sensor which sends a
+//! profile some exposures later is as many exposures: a calibration finds it ([`CarrierPlan::lag_s`]).
+//!
+//! Memory: 18 bytes a column until the run is over, 32 bytes a point after it.
+
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel, sync_channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use acies_drivers::capture::{Pose, Profile};
+use acies_drivers::device::{Losses, Robot};
+use acies_drivers::error::DeviceError;
+use glam::{DQuat, DVec3};
+
+use super::clock::{ClockFit, fit_clock};
+use super::poses::{PoseGap, PoseTrack};
+use super::run::{Message, POLL, QUEUE_PROFILES, append, chain, deliver, stop_after_failure};
+use super::{Profiling, Scan, ScanError, ScanEvent, ScanWatch, ViewRecord};
+use crate::geometry::RigidTransform;
+use crate::points::{Frame, Origin, PointCloud, View};
+
+/// A robot that carries the profilers of a scan.
+pub struct Carrier {
+    /// The device's name in the cell's configuration.
+    pub name: String,
+    /// The open robot.
+    pub robot: Box<dyn Robot>,
+    /// When the scan ends, and where the robot stands.
+    pub plan: CarrierPlan,
+}
+
+/// When a scan by a robot ends, and where the robot stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CarrierPlan {
+    /// Where the robot's base stands.
+    pub machine_from_base: RigidTransform,
+    /// Place of the tool's origin at which the scan is over, mm, in the robot's base frame; it must have been elsewhere before.
+    pub end_mm: DVec3,
+    /// How near it must come, mm.
+    pub within_mm: f64,
+    /// Added to the time of a profile before its pose is looked up, s: minus where the profiler's least delay is the longer one.
+    pub lag_s: f64,
+    /// A profiler or robot silent for this long, or a tool at rest for this long, has not reached the end: the scan is incomplete.
+    pub silence: Duration,
+}
+
+/// After the end the robot is listened to for this long at most, so that the last profiles lie between two poses.
+const AFTERWARDS: Duration = Duration::from_millis(500);
+
+/// A tool within this of where it was rests, mm: a robot that holds its place trembles by some hundredths.
+const REST_MM: f64 = 0.1;
+
+/// What the robot's thread brought.
+#[derive(Default)]
+struct Poses {
+    poses: Vec<Pose>,
+    reached: bool,
+    losses: Losses,
+    error: Option<DeviceError>,
+}
+
+/// What came of one profiler.
+#[derive(Default)]
+struct Took {
+    profiles: Vec<Profile>,
+    losses: Losses,
+    error: Option<DeviceError>,
+    /// Ended before it was told to.
+    fell_silent: bool,
+}
+
+/// Scans once: starts the robot's stream and every profiler, waits until the robot is at its end, places the profiles.
+///
+/// The calibration of a profiler here is where it is on the tool (`tool_from_sensor`); travel and encoder are not used.
+///
+/// # Errors
+/// [`ScanError`] when a device does not start; those already started are stopped.
+pub fn scan_carried(
+    mut profilers: Vec<Profiling>,
+    carrier: &mut Carrier,
+    watch: &mut dyn ScanWatch,
+) -> Result<(Scan, Vec<Profiling>), ScanError> {
+    if profilers.is_empty() {
+        return Err(ScanError::NoProfiler);
+    }
+    let not_started = |device: &str, source| ScanError::Start {
+        device: device.to_owned(),
+        source: Box::new(source),
+    };
+    carrier
+        .robot
+        .start()
+        .map_err(|source| not_started(&carrier.name, source))?;
+    for started in 0..profilers.len() {
+        let Err(source) = profilers[started].profiler.start() else {
+            continue;
+        };
+        profilers[..started].iter_mut().for_each(stop_after_failure);
+        let _ = carrier.robot.stop();
+        return Err(not_started(&profilers[started].name, source));
+    }
+    let began = Instant::now();
+    let done: Vec<AtomicBool> = profilers.iter().map(|_| AtomicBool::new(false)).collect();
+    let over = AtomicBool::new(false);
+    let (sender, receiver) = sync_channel(QUEUE_PROFILES);
+    let (shares, share) = channel();
+    let plan = carrier.plan;
+    let (took, poses) = thread::scope(|scope| {
+        for (view, profiling) in profilers.iter_mut().enumerate() {
+            let (sender, done) = (sender.clone(), &done[view]);
+            scope.spawn(move || {
+                deliver(
+                    view,
+                    profiling.profiler.as_mut(),
+                    plan.silence,
+                    &sender,
+                    done,
+                );
+            });
+        }
+        drop(sender);
+        let (robot, done, over_now) = (carrier.robot.as_mut(), &done, &over);
+        let follower = scope.spawn(move || follow(robot, plan, &shares, done, over_now));
+        let took = collect(&receiver, &share, done, watch);
+        over.store(true, Ordering::Release);
+        // A panic there has said so already; the scan then has no poses, and says that.
+        (took, follower.join().unwrap_or_default())
+    });
+    for (profiling, took) in profilers.iter().zip(&took) {
+        lost(&profiling.name, took.error.as_ref(), watch);
+    }
+    lost(&carrier.name, poses.error.as_ref(), watch);
+    let scan = place(&profilers, took, carrier, &poses, began);
+    Ok((scan, profilers))
+}
+
+fn lost(device: &str, error: Option<&DeviceError>, watch: &mut dyn ScanWatch) {
+    if let Some(error) = error {
+        watch.event(ScanEvent::Lost {
+            device: device.to_owned(),
+            error: chain(error),
+        });
+    }
+}
+
+/// Reads the robot until the profilers have ended; tells them to when it is at its end, or gone.
+fn follow(
+    robot: &mut dyn Robot,
+    plan: CarrierPlan,
+    shares: &Sender<f64>,
+    done: &[AtomicBool],
+    over: &AtomicBool,
+) -> Poses {
+    let mut brought = Poses::default();
+    let mut farthest_mm: f64 = 0.0;
+    let mut moved = Instant::now();
+    let mut rests_at: Option<DVec3> = None;
+    let mut ended: Option<Instant> = None;
+    let finish = || done.iter().for_each(|d| d.store(true, Ordering::Release));
+    loop {
+        if over.load(Ordering::Acquire) {
+            // One more pose, so that the last profile has one behind it.
+            let since = *ended.get_or_insert_with(Instant::now);
+            let behind = brought.poses.last().is_some_and(|p| p.host_time > since);
+            if behind || since.elapsed() > AFTERWARDS || brought.error.is_some() {
+                break;
+            }
+        }
+        if brought.error.is_some() {
+            // Nothing more comes; the profilers are ending.
+            thread::park_timeout(POLL);
+            continue;
+        }
+        match robot.next(Instant::now() + POLL) {
+            Ok(Some(pose)) => {
+                let stands = DVec3::from(pose.position_mm);
+                if rests_at.is_none_or(|rest| rest.distance(stands) > REST_MM) {
+                    rests_at = Some(stands);
+                    moved = Instant::now();
+                } else if moved.elapsed() > plan.silence {
+                    finish();
+                }
+                let from_end = stands.distance(plan.end_mm);
+                farthest_mm = farthest_mm.max(from_end);
+                if farthest_mm > plan.within_mm {
+                    // The watcher may have gone; that ends no scan.
+                    let _ = shares.send(1.0 - from_end / farthest_mm);
+                    if from_end <= plan.within_mm && !brought.reached {
+                        brought.reached = true;
+                        finish();
+                    }
+                }
+                brought.poses.push(pose);
+            }
+            Ok(None) if moved.elapsed() > plan.silence => finish(),
+            Ok(None) => {}
+            Err(error) => {
+                brought.error = Some(error);
+                finish();
+            }
+        }
+    }
+    if brought.error.is_none() {
+        match robot.stop() {
+            Ok(under_way) => brought.poses.extend(under_way),
+            Err(error) => brought.error = Some(error),
+        }
+    }
+    brought.losses = robot.losses();
+    brought
+}
+
+fn collect(
+    receiver: &Receiver<Message>,
+    shares: &Receiver<f64>,
+    done: &[AtomicBool],
+    watch: &mut dyn ScanWatch,
+) -> Vec<Took> {
+    let mut took: Vec<Took> = done.iter().map(|_| Took::default()).collect();
+    let (mut profiles, mut share) = (0, 0.0);
+    loop {
+        match receiver.recv_timeout(POLL) {
+            Ok(Message::Profile(view, profile)) => {
+                // Where it lies is known when the run is over.
+                watch.profile(view, &profile, &[]);
+                took[view].profiles.push(*profile);
+                profiles += 1;
+                share = shares.try_iter().last().unwrap_or(share);
+                watch.event(ScanEvent::Progress { profiles, share });
+            }
+            Ok(Message::Ended {
+                view,
+                losses,
+                error,
+            }) => {
+                took[view].losses = losses;
+                took[view].fell_silent = error.is_none() && !done[view].load(Ordering::Acquire);
+                took[view].error = error;
+            }
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => break,
+        }
+        if watch.aborted() {
+            done.iter()
+                .for_each(|view| view.store(true, Ordering::Release));
+        }
+    }
+    took
+}
+
+// ---- Placing ----------------------------------------------------------------------------------------------------------
+
+/// Why profiles of a view have no pose.
+#[derive(Default)]
+struct Unplaced {
+    outside: u64,
+    missing: u64,
+    no_clock: u64,
+}
+
+impl Unplaced {
+    fn sum(&self) -> u64 {
+        self.outside + self.missing + self.no_clock
+    }
+
+    fn findings(&self, device: &str, robot: &str) -> Vec<String> {
+        let told = [
+            (
+                self.no_clock,
+                format!(
+                    "profiles without a usable time were left out; check that {device}'s clock is on"
+                ),
+            ),
+            (
+                self.missing,
+                format!(
+                    "profiles were left out where {robot} sent no poses; check its network and its load"
+                ),
+            ),
+            (
+                self.outside,
+                format!(
+                    "profiles lie before the first or after the last pose of {robot} and were left out"
+                ),
+            ),
+        ];
+        let told = told.into_iter().filter(|(count, _)| *count > 0);
+        told.map(|(count, what)| format!("{device}: {count} {what}"))
+            .collect()
+    }
+}
+
+fn place(
+    profilers: &[Profiling],
+    took: Vec<Took>,
+    carrier: &Carrier,
+    poses: &Poses,
+    began: Instant,
+) -> Scan {
+    let robot_clock = fit_clock(&receipts(
+        poses.poses.iter().map(|p| (p.device_time_s, p.host_time)),
+        began,
+    ));
+    let mut track = PoseTrack::default();
+    for pose in &poses.poses {
+        let turn = DQuat::from_scaled_axis(pose.rotation.into());
+        let base_from_tool = RigidTransform::new(turn, pose.position_mm.into());
+        track.push(
+            pose.device_time_s,
+            carrier.plan.machine_from_base * base_from_tool,
+        );
+    }
+    let of_robot = robot_findings(carrier, poses, &track);
+    let sound = poses.reached && poses.error.is_none();
+    let mut cloud = PointCloud {
+        frame: Frame::Machine,
+        positions: Vec::new(),
+        origins: Vec::new(),
+        views: Vec::new(),
+    };
+    let mut views = Vec::new();
+    for (profiling, took) in profilers.iter().zip(took) {
+        let placed = place_view(
+            profiling,
+            &took.profiles,
+            carrier,
+            robot_clock,
+            &track,
+            began,
+        );
+        let mut findings = if views.is_empty() {
+            of_robot.clone()
+        } else {
+            Vec::new()
+        };
+        findings.extend(placed.unplaced.findings(&profiling.name, &carrier.name));
+        if let Some(error) = &took.error {
+            findings.push(format!(
+                "{}: lost during the scan: {}",
+                profiling.name,
+                chain(error)
+            ));
+        }
+        if took.fell_silent {
+            findings.push(format!(
+                "{}: silent for {} s before {} was at its end",
+                profiling.name,
+                carrier.plan.silence.as_secs_f64(),
+                carrier.name
+            ));
+        }
+        append(&mut cloud, placed.cloud, views.len() as u16);
+        views.push(ViewRecord {
+            device: profiling.name.clone(),
+            identity: profiling.profiler.identity().clone(),
+            losses: took.losses,
+            unplaced: placed.unplaced.sum(),
+            empty_columns: placed.empty_columns,
+            // A gap in the poses is a gap in the scan, as a lost profile is: what was left out is counted.
+            complete: sound && took.error.is_none() && !took.fell_silent && placed.profiles > 0,
+            findings,
+        });
+    }
+    Scan { cloud, views }
+}
+
+fn robot_findings(carrier: &Carrier, poses: &Poses, track: &PoseTrack) -> Vec<String> {
+    let (name, plan) = (&carrier.name, &carrier.plan);
+    let mut findings = Vec::new();
+    if let Some(error) = &poses.error {
+        findings.push(format!("{name}: lost during the scan: {}", chain(error)));
+    } else if !poses.reached {
+        let stood = poses.poses.last().map_or("no pose".to_owned(), |pose| {
+            let [x, y, z] = pose.position_mm;
+            format!("the tool stood at {x:.1}, {y:.1}, {z:.1} mm")
+        });
+        let DVec3 { x, y, z } = plan.end_mm;
+        findings.push(format!(
+            "{name}: the scan ended before the robot was at its end: {stood}, expected {x:.1}, {y:.1}, {z:.1} mm; check that its \
+             program ran to its end"
+        ));
+    }
+    let Losses {
+        lost_on_link,
+        rejected,
+        ..
+    } = poses.losses;
+    if lost_on_link + rejected + track.refused() > 0 {
+        findings.push(format!(
+            "{name}: {lost_on_link} poses missing by its clock, {rejected} rejected, {} out of order, {} used",
+            track.refused(),
+            poses.losses.received.saturating_sub(track.refused())
+        ));
+    }
+    findings
+}
+
+fn receipts(of: impl Iterator<Item = (f64, Instant)>, began: Instant) -> Vec<(f64, f64)> {
+    of.map(|(device_s, at)| (device_s, at.saturating_duration_since(began).as_secs_f64()))
+        .collect()
+}
+
+struct PlacedView {
+    cloud: PointCloud,
+    unplaced: Unplaced,
+    empty_columns: u64,
+    profiles: u64,
+}
+
+fn place_view(
+    profiling: &Profiling,
+    profiles: &[Profile],
+    carrier: &Carrier,
+    robot_clock: Option<ClockFit>,
+    track: &PoseTrack,
+    began: Instant,
+) -> PlacedView {
+    let tool_from_sensor = profiling.calibration.machine_from_sensor;
+    let mut placed = PlacedView {
+        cloud: PointCloud {
+            frame: Frame::Machine,
+            positions: Vec::new(),
+            origins: Vec::new(),
+            views: Vec::new(),
+        },
+        unplaced: Unplaced::default(),
+        empty_columns: 0,
+        profiles: 0,
+    };
+    let time_s = |profile: &Profile| profile.device_time_ns as f64 * 1e-9;
+    let clock = fit_clock(&receipts(
+        profiles.iter().map(|p| (time_s(p), p.host_time)),
+        began,
+    ));
+    let mut towards_sensor = DVec3::ZERO;
+    if let (Some(clock), Some(robot_clock)) = (clock, robot_clock) {
+        let times: Vec<f64> = profiles
+            .iter()
+            .map(|p| robot_clock.device(clock.host(time_s(p)) + carrier.plan.lag_s))
+            .collect();
+        for (profile, pose) in profiles.iter().zip(track.at(&times)) {
+            match pose {
+                Ok(machine_from_tool) => {
+                    let machine_from_sensor = machine_from_tool * tool_from_sensor;
+                    towards_sensor += machine_from_sensor.vector(DVec3::NEG_Z);
+                    placed.add(profile, machine_from_sensor);
+                }
+                Err(PoseGap::Missing { .. }) => placed.unplaced.missing += 1,
+                Err(PoseGap::Outside { .. } | PoseGap::Empty(_)) => placed.unplaced.outside += 1,
+            }
+        }
+    } else {
+        placed.unplaced.no_clock = profiles.len() as u64;
+    }
+    placed.cloud.views.push(View {
+        device: profiling.name.clone(),
+        // The mean over the run: a robot that turns by less than a right angle leaves it on the sensor's side.
+        towards_sensor: towards_sensor.try_normalize().unwrap_or(DVec3::Z),
+    });
+    placed
+}
+
+impl PlacedView {
+    fn add(&mut self, profile: &Profile, machine_from_sensor: RigidTransform) {
+        self.profiles += 1;
+        let index = profile.sequence.saturating_add(profile.dropped);
+        for (column, (&x_mm, &z_mm)) in profile.x_mm.iter().zip(&profile.z_mm).enumerate() {
+            if !z_mm.is_finite() {
+                self.empty_columns += 1;
+                continue;
+            }
+            let in_sensor = DVec3::new(x_mm, 0.0, z_mm);
+            self.cloud
+                .positions
+                .push(machine_from_sensor.point(in_sensor));
+            self.cloud.origins.push(Origin {
+                view: 0,
+                column: column as u16,
+                profile: index,
+            });
+        }
+    }
+}

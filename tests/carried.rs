@@ -1,0 +1,489 @@
+//! Scans by a robot: what its poses make of the profiles, against scenes known exactly, and every pose that is missing accounted for.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use acies::acquire::{Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, scan_carried};
+use acies::config::Cell;
+use acies::geometry::RigidTransform;
+use acies_drivers::capture::{Pose, Profile};
+use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot};
+use acies_drivers::error::DeviceError;
+use acies_drivers::link::cable::Cable;
+use acies_simulators::carried::{Motion, eased};
+use acies_simulators::gocator::{Form, SimulatedGocator, Surface};
+use acies_simulators::pose;
+use acies_simulators::scene::{Scene, Solid, Surfaces};
+use acies_simulators::sensor::{Fan, Optics, Traverse, View};
+use acies_simulators::ur_rtde::SimulatedRobot;
+use acies_simulators::wire::Wire;
+use acies_simulators::{gocator, ur_rtde};
+use glam::{DQuat, DVec3};
+
+// ---- Devices that deliver what was worked out beforehand --------------------------------------------------------------
+
+/// True motion of the tool in the robot's base, at true time: a curve, turning, looking down.
+fn tool(t: f64) -> RigidTransform {
+    let down = DQuat::from_rotation_x(std::f64::consts::PI);
+    let turn = DQuat::from_rotation_y(0.15 * t) * DQuat::from_rotation_z(0.1 * t);
+    RigidTransform::new(
+        turn * down,
+        DVec3::new(20.0 * (0.8 * t).sin(), 60.0 * t, 300.0 + 5.0 * t),
+    )
+}
+
+const BASE: DVec3 = DVec3::new(-250.0, 30.0, 10.0);
+const SECONDS: f64 = 2.0;
+
+/// A clock of a device: what it shows at true time, s.
+#[derive(Clone, Copy)]
+struct Clock {
+    offset_s: f64,
+    ppm: f64,
+}
+
+impl Clock {
+    fn at(self, true_s: f64) -> f64 {
+        self.offset_s + true_s * (1.0 + 1e-6 * self.ppm)
+    }
+}
+
+/// Delays that only ever add, with some next to nothing: a zigzag, and now and then a long one.
+fn delay(k: usize) -> Duration {
+    let us = match k % 7 {
+        0 => 0,
+        m => 90 * m as u64 * m as u64,
+    };
+    Duration::from_micros(us + if k % 97 == 11 { 60_000 } else { 0 })
+}
+
+fn identity() -> Identity {
+    Identity {
+        vendor: "v".into(),
+        model: "m".into(),
+        serial: "1".into(),
+        firmware: "1".into(),
+    }
+}
+
+struct Scripted<T> {
+    items: std::vec::IntoIter<T>,
+    identity: Identity,
+    given: u64,
+    lost: u64,
+}
+
+impl<T> Scripted<T> {
+    fn new(items: Vec<T>, lost: u64) -> Scripted<T> {
+        Scripted {
+            items: items.into_iter(),
+            identity: identity(),
+            given: 0,
+            lost,
+        }
+    }
+
+    fn next_item(&mut self) -> Option<T> {
+        let item = self.items.next();
+        self.given += u64::from(item.is_some());
+        item
+    }
+
+    fn account(&self) -> Losses {
+        Losses {
+            received: self.given,
+            lost_on_link: self.lost,
+            ..Losses::default()
+        }
+    }
+}
+
+impl Robot for Scripted<Pose> {
+    fn identity(&self) -> &Identity {
+        &self.identity
+    }
+
+    fn start(&mut self) -> Result<(), DeviceError> {
+        Ok(())
+    }
+
+    fn next(&mut self, _: Instant) -> Result<Option<Pose>, DeviceError> {
+        Ok(self.next_item())
+    }
+
+    fn stop(&mut self) -> Result<Vec<Pose>, DeviceError> {
+        Ok(std::iter::from_fn(|| self.next_item()).collect())
+    }
+
+    fn losses(&self) -> Losses {
+        self.account()
+    }
+}
+
+impl Profiler for Scripted<Profile> {
+    fn identity(&self) -> &Identity {
+        &self.identity
+    }
+
+    fn start(&mut self) -> Result<(), DeviceError> {
+        Ok(())
+    }
+
+    fn next(&mut self, _: Instant) -> Result<Option<Profile>, DeviceError> {
+        Ok(self.next_item())
+    }
+
+    fn stop(&mut self) -> Result<Vec<Profile>, DeviceError> {
+        Ok(std::iter::from_fn(|| self.next_item()).collect())
+    }
+
+    fn losses(&self) -> Losses {
+        self.account()
+    }
+}
+
+/// Every 4 ms from before to after the profiles, without those in `skip`.
+fn poses(clock: Clock, began: Instant, skip: std::ops::Range<usize>) -> Vec<Pose> {
+    let n = (SECONDS / 0.004) as usize + 51;
+    (0..n)
+        .filter(|k| !skip.contains(k))
+        .map(|k| {
+            let true_s = 0.004 * k as f64;
+            let pose = tool(true_s);
+            Pose {
+                device_time_s: clock.at(true_s),
+                position_mm: pose.translation.into(),
+                rotation: pose.rotation.to_scaled_axis().into(),
+                host_time: began + Duration::from_secs_f64(true_s) + delay(k),
+            }
+        })
+        .collect()
+}
+
+fn tool_from_sensor() -> RigidTransform {
+    let turn = DQuat::from_rotation_z(0.3) * DQuat::from_rotation_x(0.1);
+    RigidTransform::new(turn, DVec3::new(5.0, -12.0, 60.0))
+}
+
+/// Where a sensor's ray down its z, `x_mm` across, meets the machine's plane z = 0.
+fn to_plane(machine_from_sensor: RigidTransform, x_mm: f64) -> f64 {
+    let from = machine_from_sensor.point(DVec3::X * x_mm);
+    let along = machine_from_sensor.vector(DVec3::Z);
+    -from.z / along.z
+}
+
+/// A profile of the plane every 10 ms.
+fn profiles(clock: Clock, began: Instant) -> Vec<Profile> {
+    let base = RigidTransform::new(DQuat::IDENTITY, BASE);
+    (0..(SECONDS / 0.01) as usize)
+        .map(|k| {
+            let true_s = 0.1 + 0.01 * k as f64;
+            let machine_from_sensor = base * tool(true_s) * tool_from_sensor();
+            let x_mm: Vec<f64> = (-20..=20).map(|i| 2.0 * f64::from(i)).collect();
+            Profile {
+                sequence: k as u32,
+                boot: 0,
+                device_time_ns: (clock.at(true_s) * 1e9).round() as u64,
+                encoder: None,
+                host_time: began + Duration::from_secs_f64(true_s) + delay(k + 3),
+                dropped: 0,
+                saturated: false,
+                z_mm: x_mm
+                    .iter()
+                    .map(|x| to_plane(machine_from_sensor, *x))
+                    .collect(),
+                x_mm,
+                intensity: Vec::new(),
+            }
+        })
+        .collect()
+}
+
+fn plan() -> CarrierPlan {
+    CarrierPlan {
+        machine_from_base: RigidTransform::new(DQuat::IDENTITY, BASE),
+        end_mm: tool(SECONDS + 0.15).translation,
+        within_mm: 1.0,
+        lag_s: 0.0,
+        silence: Duration::from_millis(300),
+    }
+}
+
+fn scripted(robot: Clock, sensor: Clock, skip: std::ops::Range<usize>) -> Scan {
+    let began = Instant::now();
+    let lost = skip.len() as u64;
+    let calibration = Calibration {
+        machine_from_sensor: tool_from_sensor(),
+        travel_mm_per_count: DVec3::ZERO,
+    };
+    let profilers = vec![Profiling {
+        name: "line".into(),
+        profiler: Box::new(Scripted::new(profiles(sensor, began), 0)),
+        calibration,
+    }];
+    let mut carrier = Carrier {
+        name: "arm".into(),
+        robot: Box::new(Scripted::new(poses(robot, began, skip), lost)),
+        plan: plan(),
+    };
+    let (scan, _) = scan_carried(profilers, &mut carrier, &mut |_: ScanEvent| {}).expect("a scan");
+    scan
+}
+
+const ROBOT: Clock = Clock {
+    offset_s: 4000.0,
+    ppm: 40.0,
+};
+const SENSOR: Clock = Clock {
+    offset_s: 77.0,
+    ppm: -25.0,
+};
+
+#[test]
+fn a_plane_seen_from_a_turning_tool_is_a_plane_in_the_machine() {
+    let scan = scripted(ROBOT, SENSOR, 0..0);
+    let view = &scan.views[0];
+    assert!(view.complete && view.findings.is_empty(), "{view:?}");
+    assert_eq!((view.unplaced, scan.cloud.positions.len()), (0, 200 * 41));
+    // Between poses: the chord of a path that bends by a = 20 * 0.8^2 = 13 mm/s^2 leaves a t^2 / 8 = 26 nm, the same turning (0.18
+    // rad/s, on a lever of 300 mm) 0.3 um; of time: both lines touch receipts without delay at both ends, which leaves the
+    // nanoseconds of the stamps. The numbers of the profile are exact.
+    for point in &scan.cloud.positions {
+        assert!(point.z.abs() < 1e-3, "{point}");
+    }
+    assert!((scan.cloud.views[0].towards_sensor - DVec3::Z).length() < 0.35);
+}
+
+#[test]
+fn profiles_where_poses_are_missing_are_left_out_and_counted() {
+    let scan = scripted(ROBOT, SENSOR, 200..225);
+    let view = &scan.views[0];
+    // Poses 199 and 225 are there: times 0.796 and 0.900 s. Profiles from 0.80 to 0.89 s lie between; that at 0.90 s lies on a pose
+    // or a rounding beside it.
+    assert!((10..=11).contains(&view.unplaced), "{view:?}");
+    assert!(view.complete);
+    assert_eq!(view.findings.len(), 2);
+    assert_eq!(
+        view.findings[0],
+        "arm: 25 poses missing by its clock, 0 rejected, 0 out of order, 526 used"
+    );
+    let left_out = format!(
+        "line: {} profiles were left out where arm sent no poses; check its network and its load",
+        view.unplaced
+    );
+    assert_eq!(view.findings[1], left_out);
+    assert!(scan.cloud.positions.iter().all(|p| p.z.abs() < 1e-3));
+    let placed = scan.cloud.positions.len() as u64 / 41;
+    assert_eq!(placed + view.unplaced, view.losses.received);
+}
+
+#[test]
+fn a_clock_that_is_none_places_nothing() {
+    let stopped = Clock {
+        offset_s: 0.0,
+        ppm: -1e6,
+    };
+    let scan = scripted(ROBOT, stopped, 0..0);
+    assert!(scan.cloud.positions.is_empty() && !scan.views[0].complete);
+    assert_eq!(
+        scan.views[0].findings,
+        ["line: 200 profiles without a usable time were left out; check that line's clock is on"]
+    );
+}
+
+// ---- Simulated devices over the network -------------------------------------------------------------------------------
+
+/// A plate and a block on it, in the machine: x and y as low and high corners, and the height of the top.
+const PLATE: [DVec3; 2] = [DVec3::new(90.0, 60.0, 0.0), DVec3::new(210.0, 260.0, 40.0)];
+const BLOCK: [DVec3; 2] = [
+    DVec3::new(120.0, 110.0, 40.0),
+    DVec3::new(180.0, 180.0, 65.0),
+];
+
+fn scene() -> Scene {
+    let mut surfaces = Surfaces::default();
+    let (plate, _) = surfaces.cuboid("plate", PLATE[0], PLATE[1]);
+    let (block, _) = surfaces.cuboid("block", BLOCK[0], BLOCK[1]);
+    Scene::new(surfaces, Solid::any([plate, block]))
+}
+
+/// Distance of a point from the surface of a box.
+fn from_box([low, high]: [DVec3; 2], p: DVec3) -> f64 {
+    let beyond = (low - p).max(p - high);
+    let outside = beyond.max(DVec3::ZERO).length();
+    outside + beyond.max_element().min(0.0)
+}
+
+/// Distance of a point from the surface of what is seen.
+fn from_surface(p: DVec3) -> f64 {
+    from_box(PLATE, p).min(from_box(BLOCK, p)).abs()
+}
+
+const SPEED_MM_S: f64 = 80.0;
+const TURN_RAD: f64 = 0.1;
+
+/// Along the machine's y over the block, looking down, turning a little; base of the robot as in the example cell.
+fn motion() -> Motion {
+    let seconds = 1.25 * 200.0 / SPEED_MM_S;
+    Motion::new(move |t| {
+        let share = eased(t / seconds);
+        let down = pose::Pose::turn_about(DVec3::ZERO, DVec3::X, std::f64::consts::PI);
+        let turn = pose::Pose::turn_about(DVec3::ZERO, DVec3::Y, TURN_RAD * (share - 0.5));
+        let place = pose::Pose::shift(DVec3::new(400.0, 50.0 + 200.0 * share, 300.0));
+        place.after(turn).after(down)
+    })
+}
+
+fn view() -> View {
+    View {
+        scene: Arc::new(scene()),
+        // The motion is in the base's frame, the scene in the machine's.
+        machine_from_scene: pose::Pose::shift(DVec3::X * 250.0),
+        machine_from_sensor: pose::Pose::shift(DVec3::Z * 60.0),
+        optics: Optics {
+            near_mm: 120.0,
+            far_mm: 260.0,
+            width_mm: 100.0,
+            fan: Fan::Parallel,
+            camera_mm: DVec3::new(0.0, 100.0, 0.0),
+            spot_mm: 0.0,
+            blend_mm: 0.5,
+            noise_mm: 0.0,
+            drop_out: 0.0,
+            incidence_limit_rad: 1.4,
+            outliers: 0.0,
+        },
+        traverse: Traverse {
+            axis: DVec3::Y,
+            mm_per_count: 1.0,
+            first_count: 0,
+            step_counts: 1,
+            profiles: u32::MAX,
+        },
+        columns: 100,
+        seed: 5,
+    }
+}
+
+/// The example cell against simulated devices with these faults of the robot.
+fn simulated(faults: &str) -> (Scan, ur_rtde::Truth) {
+    let motion = Arc::new(motion());
+    let mut robot = ur_rtde::Setup::new(Arc::clone(&motion), 9);
+    robot.faults = faults.parse().expect("the test's faults");
+    let wire = Wire::tcp("127.0.0.1:0".parse().expect("an address")).expect("a socket");
+    let robot = SimulatedRobot::start(wire, robot).expect("a robot");
+    let line = gocator::Setup {
+        form: Form::PointCloud,
+        rate_hz: Some(100.0),
+        ..gocator::Setup::new(13_434, Surface::Carried(Box::new(view()), motion))
+    };
+    let line = SimulatedGocator::start(line).expect("a sensor");
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/ur-rtde/cell.toml");
+    let text = std::fs::read_to_string(&path).expect("the example cell");
+    let text = text
+        .replace("192.168.1.30", robot.port())
+        .replace("address = \"192.168.1.10\"", &line.keys())
+        .replace("silence_s = 5.0", "silence_s = 1.0");
+    let cell = Cell::parse(&text, &path).unwrap_or_else(|errors| panic!("{errors}"));
+    let profilers = cell.profilers.iter().map(|config| {
+        let Ok(Instrument::Profiler(profiler)) = config.setup.open(&Cable) else {
+            panic!("no profiler");
+        };
+        Profiling {
+            name: config.name.clone(),
+            profiler,
+            calibration: config.calibration,
+        }
+    });
+    let profilers = profilers.collect();
+    let config = cell.carrier.as_ref().expect("a carrier");
+    let Ok(Instrument::Robot(arm)) = config.setup.open(&Cable) else {
+        panic!("no robot");
+    };
+    let mut carrier = Carrier {
+        name: config.name.clone(),
+        robot: arm,
+        plan: config.plan,
+    };
+    let (scan, _) = scan_carried(profilers, &mut carrier, &mut |_: ScanEvent| {}).expect("a scan");
+    (scan, robot.truth())
+}
+
+/// What the two links' least delays may differ by on a busy machine, s. It moves a point along the path by this much of the speed, and by
+/// the turning on the lever from tool to part; 10 um are the sensor's counts and the chords.
+const LEAST_DELAY_S: f64 = 2e-3;
+
+fn tolerance_mm() -> f64 {
+    let seconds = 1.25 * 200.0 / SPEED_MM_S;
+    let turning = 1.25 * TURN_RAD / seconds * 260.0;
+    LEAST_DELAY_S * (SPEED_MM_S + turning) + 0.01
+}
+
+#[test]
+fn a_block_scanned_by_a_simulated_robot_stands_where_it_stands() {
+    let (scan, truth) = simulated("drift-ppm=60");
+    let view = &scan.views[0];
+    assert!(view.complete, "{:?}", view.findings);
+    let placed = view.losses.received - view.unplaced;
+    assert!(placed > 200, "{view:?}");
+    let far: Vec<f64> = scan
+        .cloud
+        .positions
+        .iter()
+        .map(|p| from_surface(*p))
+        .collect();
+    let worst = far.iter().copied().fold(0.0, f64::max);
+    let rms = (far.iter().map(|d| d * d).sum::<f64>() / far.len() as f64).sqrt();
+    assert!(
+        worst < tolerance_mm(),
+        "worst {worst:.4} mm, rms {rms:.4} mm"
+    );
+    assert!(far.len() > 10_000);
+    // The block's far and near sides are seen only as edges of its top: the points on the top end where the block ends.
+    let top = scan
+        .cloud
+        .positions
+        .iter()
+        .filter(|p| (p.z - 65.0).abs() < 0.05);
+    let (low, high) = top.fold((f64::MAX, f64::MIN), |(l, h), p| (l.min(p.y), h.max(p.y)));
+    // One profile at 100 Hz beside the tolerance.
+    let step = SPEED_MM_S / 100.0;
+    assert!((low - 110.0).abs() < step + tolerance_mm(), "{low}");
+    assert!((high - 180.0).abs() < step + tolerance_mm(), "{high}");
+    assert!(!truth.running, "the stream was paused");
+}
+
+#[test]
+fn skipped_poses_leave_gaps_and_nothing_is_made_up() {
+    // Of a third of the poses, one in nine gaps is three cycles and more.
+    let (scan, truth) = simulated("drop=0.33");
+    let view = &scan.views[0];
+    assert!(view.complete, "{:?}", view.findings);
+    assert!(view.unplaced > 5, "{view:?}");
+    let skipped = truth
+        .cycles
+        .iter()
+        .filter(|c| c.1 == ur_rtde::Fate::Skipped);
+    assert!(skipped.count() > 300);
+    let mut placed: Vec<u32> = scan.cloud.origins.iter().map(|o| o.profile).collect();
+    placed.dedup();
+    // Profiles in which nothing was seen have no points and are placed all the same.
+    assert!(placed.len() as u64 + view.unplaced <= view.losses.received);
+    for point in &scan.cloud.positions {
+        assert!(from_surface(*point) < tolerance_mm(), "{point}");
+    }
+}
+
+#[test]
+fn a_robot_that_is_lost_leaves_the_scan_incomplete_with_what_came_before() {
+    let (scan, _) = simulated("unplug-after=900");
+    let view = &scan.views[0];
+    assert!(!view.complete && !scan.cloud.positions.is_empty());
+    assert!(
+        view.findings[0].starts_with("arm: lost during the scan: ")
+            && view.findings[0]
+                .ends_with("it is gone: closed or unplugged; plug it in again and reopen"),
+        "{:?}",
+        view.findings
+    );
+}
