@@ -895,6 +895,7 @@ impl Running {
         if let Err(error) = noted {
             self.fault = Some(chain(&error));
         }
+        self.look_at_disk();
     }
 
     fn concluded(&mut self, id: i64, result: Result<Inspection, String>) {
