@@ -103,7 +103,7 @@ fn unknown_keys_wrong_units_and_wrong_types_are_told_together() {
         mistakes("together", &text),
         [
             "cell.toml: name: nothing, expected a text",
-            "cell.toml:1: nmae: an unknown key, expected one of name, part, device, stage",
+            "cell.toml:1: nmae: an unknown key, expected one of name, part, device, service, stage",
             "cell.toml:4: part: nominal: no file absent.step, expected a file that exists",
             "cell.toml:12: stage: end_count: \"60 mm\", expected a whole number of -1000000000000 to \
              1000000000000",
@@ -312,6 +312,53 @@ fn every_example_of_a_driver_opens_its_simulated_devices() {
             open.stop().expect("a stop");
         }
     }
+}
+
+#[test]
+fn a_service_that_others_could_listen_to_is_refused_and_the_defaults_are_safe() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo/cell.toml");
+    let text = std::fs::read_to_string(&path).expect("the demo's cell");
+    let service = Cell::parse(&text, &path).expect("in order").service;
+    assert!(service.address.ip().is_loopback() && service.tls.is_none());
+    assert_eq!(service.store, path.with_file_name("store"));
+    assert_eq!(service.anonymous, Some(acies::store::Role::Operator));
+    assert!(!service.simulated);
+    let told = |lines: &str| -> Vec<String> {
+        let text = text.replacen("[part]", &format!("[service]\n{lines}\n[part]"), 1);
+        match Cell::parse(&text, &path) {
+            Ok(_) => Vec::new(),
+            Err(errors) => errors
+                .mistakes
+                .iter()
+                .map(|m| m.mistake.to_string())
+                .collect(),
+        }
+    };
+    assert_eq!(
+        told("address = \"0.0.0.0:8370\""),
+        [
+            "address: 0.0.0.0:8370 without a certificate, expected certificate and private_key for an address that others can \
+             reach: passwords would be readable on the way"
+        ]
+    );
+    assert_eq!(
+        told("address = \"0.0.0.0:8370\"\ncertificate = \"a.pem\"\nprivate_key = \"a.key\""),
+        [""; 0]
+    );
+    assert_eq!(
+        told("certificate = \"a.pem\"\nqueue_limit = -1"),
+        [
+            "queue_limit: -1, expected a whole number of 0 to 1000",
+            "certificate: one of two, expected certificate and private_key, or neither"
+        ]
+    );
+    assert_eq!(
+        told("address = \"here\"\nanonymous = \"setter\""),
+        [
+            "anonymous: \"setter\", expected \"operator\" or \"nobody\"",
+            "address: \"here\", expected an address and a port, as in \"127.0.0.1:8370\""
+        ]
+    );
 }
 
 #[test]
