@@ -17,6 +17,9 @@ use super::app::App;
 use super::problem::Problem;
 use crate::store::Role;
 
+/// Largest body that any route takes, bytes: a recipe with the nominal of a large part in base64.
+pub(super) const LARGEST: u64 = 64 << 20;
+
 /// The least that a route asks for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Need {
@@ -108,7 +111,7 @@ pub(super) struct Who {
     pub role: Option<Role>,
     /// Whether they have logged in.
     pub known: bool,
-    /// The key they showed.
+    /// The session of their browser; a token is no session and is ended by the administrator.
     pub secret: Option<String>,
 }
 
@@ -143,6 +146,7 @@ async fn admit(app: &App, request: &Parts) -> Result<Who, Problem> {
     if !safe {
         from_here(&request.headers)?;
     }
+    not_too_large(&request.headers)?;
     let who = who(app, &request.headers).await?;
     let Some(path) = request.extensions.get::<MatchedPath>() else {
         // Nothing stands there; the fallback says so.
@@ -177,6 +181,22 @@ fn not_allowed(who: &Who, least: Role) -> Problem {
         format!("nobody has logged in, this asks for {least}"),
         "log in, or send a token in the header Authorization: Bearer",
     )
+}
+
+/// A body that says itself that no route takes so much is not read at all; the routes' own limits are below this one.
+fn not_too_large(headers: &HeaderMap) -> Result<(), Problem> {
+    let length = headers.get(header::CONTENT_LENGTH);
+    let length = length.and_then(|length| length.to_str().ok()?.parse::<u64>().ok());
+    match length {
+        Some(length) if length > LARGEST => Err(Problem::new(
+            StatusCode::PAYLOAD_TOO_LARGE,
+            "body",
+            "The body is too large",
+            format!("{length} bytes, expected at most {LARGEST}"),
+            "send less; the limits are in the README",
+        )),
+        _ => Ok(()),
+    }
 }
 
 /// On a loopback address the page is called by a loopback name only: a name of somebody else's that leads here is an attempt to
@@ -264,7 +284,7 @@ async fn who(app: &App, headers: &HeaderMap) -> Result<Who, Problem> {
             name: person.name,
             role: Some(person.role),
             known: true,
-            secret: Some(secret),
+            secret: (!from_header).then_some(secret),
         }),
         None if from_header => Err(Problem::new(
             StatusCode::UNAUTHORIZED,

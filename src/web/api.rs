@@ -22,6 +22,7 @@ use utoipa::{PartialSchema, ToSchema};
 use utoipa_axum::router::{OpenApiRouter, UtoipaMethodRouterExt as _};
 use utoipa_axum::routes;
 
+use super::access::LARGEST;
 use super::app::App;
 use super::problem::Problem;
 
@@ -135,7 +136,7 @@ pub(super) fn routes() -> (Router<App>, String) {
 
 /// For bodies that carry the nominal of a large part in base64.
 fn large() -> DefaultBodyLimit {
-    DefaultBodyLimit::max(64 << 20)
+    DefaultBodyLimit::max(LARGEST as usize)
 }
 
 /// Every operation may answer with a problem; said once here, not at each.

@@ -58,7 +58,7 @@ pub struct Start {
 ///
 /// A trigger that is repeated with the same `Idempotency-Key` measures once and gets the same inspection again.
 #[utoipa::path(post, path = "/api/v1/inspections", tag = "inspections", request_body = Start,
-    params(("Idempotency-Key" = Option<String>, Header, description = "chosen by the caller, another one for each part; up to 255 visible ASCII characters")),
+    params(("Idempotency-Key" = Option<String>, Header, min_length = 1, max_length = 255, pattern = "^[!-~]+$", description = "chosen by the caller, another one for each part; up to 255 visible ASCII characters")),
     responses((status = 201, description = "taken", body = Inspection, headers(("Location" = String, description = "its address")))))]
 pub async fn start(
     State(app): State<App>,
@@ -287,6 +287,7 @@ pub enum Form {
 #[serde(default)]
 pub struct ExportForm {
     /// `csv` or `jsonl`.
+    #[param(inline)]
     form: Form,
 }
 

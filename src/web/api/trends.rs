@@ -14,8 +14,11 @@ use crate::web::problem::{Asked, Place, Problem};
 const D2: f64 = 1.128;
 /// Upper limit of the moving range, as a multiple of its mean: the same tables, D4 for n = 2.
 const D4: f64 = 3.267;
-/// Fewer values say nothing about a spread that could be defended.
+/// A range needs two values.
 const ENOUGH: usize = 2;
+/// Below so many values capability is not given: its own spread would be larger than what it is to tell (Montgomery, 6.2, wants
+/// 20 to 25 samples before limits are taken for those of the process).
+const CAPABLE: usize = 20;
 
 /// The characteristics that were ever measured, by name.
 #[utoipa::path(get, path = "/api/v1/characteristics", tag = "trends",
@@ -63,9 +66,9 @@ pub struct Statistics {
     control_upper: f64,
     /// Upper control limit of a moving range: 3.267 times its mean.
     moving_range_upper: f64,
-    /// Tolerance over six sigma within; null without both limits or without spread.
+    /// Tolerance over six sigma within; null without both limits, without spread, or below 20 values.
     cp: Option<f64>,
-    /// Distance of the mean to the nearer limit over three sigma within; null without any limit or without spread.
+    /// Distance of the mean to the nearer limit over three sigma within; null without any limit, without spread, or below 20 values.
     cpk: Option<f64>,
     /// As `cp`, with sigma overall.
     pp: Option<f64>,
@@ -108,15 +111,16 @@ fn statistics(values: &[f64], lower: Option<f64>, upper: Option<f64>) -> Option<
     let sigma_overall = (squares.sum::<f64>() / (count - 1) as f64).sqrt();
     let sigma_within = mean_range / D2;
     let (control_lower, control_upper) = (mean - 3.0 * sigma_within, mean + 3.0 * sigma_within);
+    let capable = count >= CAPABLE;
     let spread = |sigma: f64| {
         let (lower, upper) = (lower?, upper?);
-        (sigma > 0.0).then(|| (upper - lower) / (6.0 * sigma))
+        (capable && sigma > 0.0).then(|| (upper - lower) / (6.0 * sigma))
     };
     let nearer = |sigma: f64| {
         let below = lower.map(|lower| mean - lower);
         let above = upper.map(|upper| upper - mean);
         let nearest = below.into_iter().chain(above).min_by(f64::total_cmp)?;
-        (sigma > 0.0).then(|| nearest / (3.0 * sigma))
+        (capable && sigma > 0.0).then(|| nearest / (3.0 * sigma))
     };
     let inside = |value: &&f64| (control_lower..=control_upper).contains(*value);
     Some(Statistics {
@@ -162,11 +166,14 @@ mod tests {
     }
 
     #[test]
-    fn without_spread_or_limits_there_is_no_capability() {
+    fn without_spread_limits_or_enough_values_there_is_no_capability() {
         assert_eq!(statistics(&[1.0], None, None), None);
-        let still = statistics(&[1.0, 1.0, 1.0], Some(0.0), Some(2.0)).expect("3 values");
+        let still = statistics(&[1.0; 30], Some(0.0), Some(2.0)).expect("30 values");
         assert_eq!((still.cp, still.cpk), (None, None));
-        let upper = statistics(&[1.0, 2.0, 1.0], None, Some(4.0)).expect("3 values");
+        let few = statistics(&[1.0, 2.0, 1.0], Some(0.0), Some(4.0)).expect("3 values");
+        assert_eq!((few.cp, few.cpk), (None, None));
+        let many: Vec<f64> = (0..30).map(|index| f64::from(index % 3)).collect();
+        let upper = statistics(&many, None, Some(4.0)).expect("30 values");
         assert_eq!(upper.cp, None);
         assert!(
             upper.cpk.is_some(),

@@ -20,7 +20,8 @@ export function livePictures() {
   const points = new Points(cloud);
   let timer = 0;
   let ended = false;
-  let running = false;
+  // Nothing yet: the first look shows the scan that ran last.
+  let running = null;
   const look = async () => {
     try {
       const [profiles] = await Promise.all([get("/live/profiles"), points.fetch()]);
@@ -135,7 +136,7 @@ class Points {
       if (values[index] > high[axis]) high[axis] = values[index];
     }
     const middle = low.map((value, axis) => (value + high[axis]) / 2);
-    const zoom = 0.92 * Math.min(width, height * 1.4) / Math.max(Math.hypot(...high.map((value, axis) => value - low[axis])), 1e-3);
+    const zoom = 0.92 * Math.min(width, height * 1.2) / Math.max(Math.hypot(...high.map((value, axis) => value - low[axis])), 1e-3);
     const [sine, cosine] = [Math.sin(this.turn), Math.cos(this.turn)];
     const [rise, flat] = [Math.sin(this.tilt), Math.cos(this.tilt)];
     const image = context.createImageData(width, height);

@@ -65,5 +65,6 @@ export function bytes(value) {
 /** A time that the API gave. */
 export function time(text) {
   if (!text) return "–";
-  return new Intl.DateTimeFormat(language, { dateStyle: "short", timeStyle: "medium" }).format(new Date(text));
+  // Days before months: 11/12 is read in two ways, and German and British agree on one.
+  return new Intl.DateTimeFormat(language === "en" ? "en-GB" : language, { dateStyle: "short", timeStyle: "medium" }).format(new Date(text));
 }

@@ -2,7 +2,7 @@
 
 import { get, post } from "../api.js";
 import { fill, h } from "../dom.js";
-import { bytes, count, t, time, word } from "../text.js";
+import { bytes, count, number, t, time, word } from "../text.js";
 
 const SIGNS = { ready: "✓", busy: "…", connecting: "…", failed: "✕" };
 
@@ -42,7 +42,7 @@ export function devices(view, page) {
           device.error ? h("p.bad", {}, device.error) : null,
           h("dl.facts", {}, [
             ["identity", device.identity ?? "–"], ["since", time(device.since)], ["opened", count(device.opened)], ["failures", count(device.failures)],
-            ["received", count(device.received)], ["lost", device.received ? `${count(device.lost)} (${(100 * device.lost / (device.received + device.lost)).toFixed(2)} %)` : count(device.lost)],
+            ["received", count(device.received)], ["lost", device.received ? `${count(device.lost)} (${number(100 * device.lost / (device.received + device.lost), 2)} %)` : count(device.lost)],
             ["calibrated", device.calibrated ? time(device.calibrated) : t("nobody.says")], ["calibrated_until", calibration],
           ].map(fact))));
     }));

@@ -41,7 +41,7 @@ export function inspection(view, page, [id]) {
         h("div.row", {}, done ? [link("report.json", "JSON"), link("report.csv", "CSV"), link("report.html", "HTML")] : null,
           found.scan_bytes === null ? null : [link("scan.ply", "PLY"), link("scan.raw", t("raw.file"))])));
     if (!done) return;
-    const frame = h("iframe", { src: `${base}/report.html`, title: t("report.frame"), id: "report", sandbox: "allow-scripts allow-same-origin allow-downloads" });
+    const frame = h("iframe", { src: `${base}/report.html`, title: t("report.frame"), id: "report" });
     const worst = h("section.card", {});
     view.append(worst, h("section.card", {}, h("h2", {}, t("report.frame")), frame));
     const report = await get(`/inspections/${found.id}/report.json`);

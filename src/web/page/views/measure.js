@@ -87,7 +87,7 @@ export function measure(view, page) {
     if (running || computing) {
       const job = running ?? computing;
       board.dataset.verdict = "busy";
-      say(sign, "…");
+      say(sign, "⋯");
       say(big, word("step.big", job.step));
       say(part, job.part_serial);
       say(reason, job.findings.at(-1) ?? "");
@@ -97,7 +97,7 @@ export function measure(view, page) {
       say(step, job.step === "touching" && job.touches ? t("touches", { done: job.touches[0], of: job.touches[1] }) : t("profiles", { count: job.profiles }));
     } else if (snapshot.cause) {
       board.dataset.verdict = snapshot.state === "preoperational" ? "busy" : "stopped";
-      say(sign, snapshot.state === "preoperational" ? "…" : "!");
+      say(sign, snapshot.state === "preoperational" ? "⋯" : "!");
       say(big, word("state", snapshot.state));
       say(part, "");
       say(reason, snapshot.cause);

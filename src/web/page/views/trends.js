@@ -3,7 +3,7 @@
 import { get, query } from "../api.js";
 import { fill, h, svg, table } from "../dom.js";
 import { number, signed, t, time } from "../text.js";
-import { badge, digits } from "../verdict.js";
+import { badge, digits, worstFirst } from "../verdict.js";
 
 const [WIDTH, HEIGHT, LEFT, RIGHT, TOP, BOTTOM] = [1200, 420, 80, 130, 20, 40];
 
@@ -25,13 +25,21 @@ export function trends(view, page, [wanted]) {
     try {
       const all = await get("/characteristics");
       all.sort(new Intl.Collator(undefined, { numeric: true }).compare);
-      fill(which, all.map((name) => h("option", { value: name, selected: name === wanted }, name)));
+      const chosen = all.includes(wanted) ? wanted : await worst();
+      fill(which, all.map((name) => h("option", { value: name, selected: name === chosen }, name)));
       // Nothing of a simulated cell counts: there, everything is what there is to see.
       everything.checked = Boolean(page.snapshot?.simulated);
       await load();
     } catch (error) {
       await page.fail(error);
     }
+  }
+
+  /** Where nobody asks for another one: what is worst at the last part. */
+  async function worst() {
+    const last = page.snapshot?.last;
+    if (last?.phase !== "done") return null;
+    return worstFirst(await get(`/inspections/${last.id}/report.json`)).find((found) => found.value !== null)?.id;
   }
 
   async function load() {
