@@ -24,7 +24,7 @@ use utoipa_axum::routes;
 
 use super::access::LARGEST;
 use super::app::App;
-use super::problem::Problem;
+use super::problem::Details;
 
 /// One page of a list; newest first.
 #[derive(Debug, Serialize, ToSchema)]
@@ -86,7 +86,7 @@ pub(super) fn routes() -> (Router<App>, String) {
         .fold(ComponentsBuilder::new(), |all, (name, scheme)| {
             all.security_scheme(name, scheme)
         })
-        .schema(Problem::name(), Problem::schema())
+        .schema(Details::name(), Details::schema())
         .build();
     let mut document = OpenApi::new(info, utoipa::openapi::Paths::new());
     document.components = Some(components);
@@ -146,7 +146,7 @@ fn tell_of_problems(document: &mut OpenApi) {
         .content(
             "application/problem+json",
             ContentBuilder::new()
-                .schema(Some(Ref::from_schema_name(Problem::name())))
+                .schema(Some(Ref::from_schema_name(Details::name())))
                 .build(),
         )
         .build();

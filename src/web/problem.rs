@@ -15,8 +15,13 @@ use crate::cell::{CellError, Refusal};
 use crate::store::{Inspection, StoreError};
 
 /// Why a request was not done, and what to do about it: RFC 9457, `application/problem+json`.
+#[derive(Debug, Clone)]
+pub(super) struct Problem(Box<Details>);
+
+/// Why a request was not done, and what to do about it (RFC 9457).
 #[derive(Debug, Clone, Serialize, ToSchema)]
-pub(super) struct Problem {
+#[schema(as = Problem)]
+pub(super) struct Details {
     /// Which kind: `urn:acies:problem:` and a word.
     #[serde(rename = "type")]
     kind: String,
@@ -45,7 +50,7 @@ impl Problem {
         detail: impl Into<String>,
         what_to_do: impl Into<String>,
     ) -> Self {
-        Self {
+        Self(Box::new(Details {
             kind: format!("urn:acies:problem:{word}"),
             title,
             status: status.as_u16(),
@@ -53,12 +58,12 @@ impl Problem {
             what_to_do: what_to_do.into(),
             inspection: None,
             retry_after_s: None,
-        }
+        }))
     }
 
     /// Tells when it may be tried again.
     pub fn retry_after(mut self, seconds: u64) -> Self {
-        self.retry_after_s = Some(seconds);
+        self.0.retry_after_s = Some(seconds);
         self
     }
 
@@ -159,28 +164,28 @@ impl Problem {
             )
             .retry_after(5),
         };
-        problem.inspection = kept.map(|inspection| inspection.id);
+        problem.0.inspection = kept.map(|inspection| inspection.id);
         problem
     }
 
     /// The status of the answer.
     pub fn status(&self) -> StatusCode {
-        StatusCode::from_u16(self.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR)
+        StatusCode::from_u16(self.0.status).unwrap_or(StatusCode::INTERNAL_SERVER_ERROR)
     }
 }
 
 impl IntoResponse for Problem {
     fn into_response(self) -> Response {
-        let mut answer = (self.status(), Json(&self)).into_response();
+        let mut answer = (self.status(), Json(&self.0)).into_response();
         let headers = answer.headers_mut();
         headers.insert(
             header::CONTENT_TYPE,
             HeaderValue::from_static("application/problem+json"),
         );
-        if let Some(seconds) = self.retry_after_s {
+        if let Some(seconds) = self.0.retry_after_s {
             headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
         }
-        if self.status == StatusCode::UNAUTHORIZED.as_u16() {
+        if self.0.status == StatusCode::UNAUTHORIZED.as_u16() {
             let bearer = HeaderValue::from_static("Bearer realm=\"acies\"");
             headers.insert(header::WWW_AUTHENTICATE, bearer);
         }

@@ -306,7 +306,7 @@ fn shots(browser: &Browser, cell: &Served, operator: &Seen) {
     let page = Seen::open(browser, cell);
     page.login("administrator");
     let last = cell.handle().snapshot().last.as_ref().expect("a result").id;
-    let name = page.value("fetch('/api/v1/characteristics').then((a) => a.json()).then((a) => { window.first = a.find((n) => n.endsWith('.d1')); })");
+    let name = page.value("fetch('/api/v1/characteristics').then((a) => a.json()).then((a) => { window.first = a.find((n) => n === 'foot of the wall.d1'); })");
     assert!(!name.is_empty());
     page.until("window.first");
     let trend = format!("trends/{}", page.value("encodeURIComponent(first)"));

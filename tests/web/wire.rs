@@ -102,13 +102,16 @@ fn a_file_that_is_known_is_not_sent_again() {
 fn a_body_that_is_too_large_is_refused_before_it_is_read() {
     let cell = Served::without_devices("large", |_| ());
     let request = format!(
-        "POST /api/v1/inspections HTTP/1.1\r\nHost: {}\r\nContent-Type: application/json\r\nContent-Length: 2000000000\r\n\r\n{{",
+        "POST /api/v1/inspections HTTP/1.1\r\nHost: {}\r\nContent-Type: application/json\r\nContent-Length: 2000000000\r\n\r\n",
         cell.address
     );
     let (head, body) = speak(&cell, request.as_bytes());
     assert!(head.starts_with("http/1.1 413"), "{head}");
     assert!(body.contains("urn:acies:problem:body"), "{body}");
-    let many = json!({"part_serial": "A", "order_number": "x".repeat(2 << 20)});
+    // One byte more than is taken: all of it is read before the answer, so that closing the connection does not overtake it.
+    let order = |length: usize| json!({"part_serial": "A", "order_number": "x".repeat(length)});
+    let around = order(0).to_string().len();
+    let many = order((1 << 20) + 1 - around);
     cell.post("/api/v1/inspections", &many).problem(413, "body");
 }
 
@@ -173,6 +176,32 @@ fn events_begin_with_what_is_so_and_follow_every_change() {
     cell.stop();
     let mut rest = Vec::new();
     stream.read_to_end(&mut rest).expect("a regular end");
+}
+
+#[test]
+fn more_watchers_than_there_are_places_are_told_to_come_back() {
+    let cell = Served::without_devices("watchers", |_| ());
+    let request = format!(
+        "GET /api/v1/events HTTP/1.1\r\nHost: {}\r\n\r\n",
+        cell.address
+    );
+    let watchers: Vec<TcpStream> = (0..64)
+        .map(|_| {
+            let mut stream = open(&cell);
+            stream
+                .write_all(request.as_bytes())
+                .expect("the server reads");
+            let mut first = [0; 15];
+            stream.read_exact(&mut first).expect("an answer");
+            assert_eq!(&first, b"HTTP/1.1 200 OK");
+            stream
+        })
+        .collect();
+    let refused = cell.get("/api/v1/events");
+    refused.problem(503, "busy");
+    assert_eq!(refused.header("retry-after"), "30");
+    assert_eq!(cell.get("/api/v1/status").status, 200, "others are served");
+    drop(watchers);
 }
 
 #[test]

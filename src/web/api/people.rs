@@ -26,11 +26,12 @@ pub async fn list(State(app): State<App>) -> Result<Json<Vec<Person>>, Problem> 
 #[derive(Deserialize, ToSchema)]
 pub struct NewPerson {
     /// The name to log in with: 1 to 64 characters.
+    #[schema(min_length = 1, max_length = 64)]
     name: String,
     /// What they may do.
     role: Role,
     /// 8 to 256 bytes.
-    #[schema(format = Password)]
+    #[schema(format = Password, min_length = 8, max_length = 256)]
     password: String,
 }
 
@@ -59,7 +60,7 @@ pub struct ChangedPerson {
     /// What they may do.
     role: Option<Role>,
     /// A new password.
-    #[schema(format = Password)]
+    #[schema(format = Password, min_length = 8, max_length = 256)]
     password: Option<String>,
     /// Whether they may log in.
     enabled: Option<bool>,
@@ -148,6 +149,7 @@ pub struct NewToken {
     /// Whose rights it has.
     person: String,
     /// What it is for.
+    #[schema(min_length = 1, max_length = 100)]
     label: String,
     /// After how many days it ends: 1 to 3650.
     #[schema(minimum = 1, maximum = 3650)]

@@ -62,10 +62,12 @@ pub struct RecipeFile {
     /// `acies-recipe/1`.
     format: Format,
     /// What the line calls it.
+    #[schema(min_length = 1, max_length = 100)]
     name: String,
     /// TOML.
     text: String,
     /// File name of the nominal, with its ending.
+    #[schema(min_length = 1, max_length = 100)]
     nominal_name: String,
     /// The nominal's bytes in base64.
     nominal_base64: String,
@@ -112,10 +114,12 @@ pub struct Draft {
 #[derive(Debug, Deserialize, ToSchema)]
 pub struct NewVersion {
     /// What the line calls it.
+    #[schema(min_length = 1, max_length = 100)]
     name: String,
     #[serde(flatten)]
     draft: Draft,
     /// Why it is made.
+    #[schema(min_length = 1, max_length = 500)]
     why: String,
 }
 
@@ -139,7 +143,7 @@ pub async fn check(
 ) -> Result<Json<Checked>, Problem> {
     let checked = app.heavy(move |handle| {
         let (name, bytes) = nominal_in(handle.store(), &draft)?;
-        Ok::<_, Problem>(checked(handle, &draft.text, &name, &bytes)?)
+        checked(handle, &draft.text, &name, &bytes)
     });
     Ok(Json(checked.await?))
 }
@@ -205,6 +209,7 @@ pub async fn import(
 #[derive(Debug, Deserialize, ToSchema)]
 pub struct Activation {
     /// The reason, for the audit log.
+    #[schema(min_length = 1, max_length = 500)]
     why: String,
 }
 
