@@ -60,9 +60,10 @@ const colour = (name) => getComputedStyle(document.documentElement).getPropertyV
 
 function drawProfiles(canvas, profiles) {
   const { context, width, height, scale } = surface(canvas);
-  context.clearRect(0, 0, width, height);
   const seen = profiles.filter((profile) => profile.z_mm.some((z) => z !== null));
+  // Behind the part nothing is in view: the last profile of the part stays.
   if (!seen.length) return;
+  context.clearRect(0, 0, width, height);
   const strip = height / seen.length;
   context.font = `${13 * scale}px system-ui, sans-serif`;
   seen.forEach((profile, index) => {
