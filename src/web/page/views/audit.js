@@ -9,10 +9,13 @@ export function audit(view, page) {
   let ends = [];
   fill(view, h("h1", {}, t("nav.audit")), list);
 
+  /** The beginning of a hash tells it from others; the whole is in the hint. */
+  const short = (text) => h("span", { title: text }, text.replace(/[0-9a-f]{64}/g, (hash) => `${hash.slice(0, 12)}…`) || "–");
+
   async function load() {
     try {
       const found = await get(`/audit${query({ before: ends.at(-1), limit: 50 })}`);
-      const rows = found.items.map((one) => ({ cells: [String(one.id), time(one.at), one.person, one.action, one.subject, one.old || "–", one.new || "–", one.why || "–"] }));
+      const rows = found.items.map((one) => ({ cells: [String(one.id), time(one.at), one.person, one.action, one.subject, short(one.old), short(one.new), one.why || "–"] }));
       fill(list, table(["id", "at", "person", "action", "subject", "old", "new", "why"].map((name) => t(`column.${name}`)), rows),
         h("div.row", {},
           h("button", { type: "button", id: "newer", disabled: !ends.length, onclick: () => { ends.pop(); load(); } }, t("newer")),
