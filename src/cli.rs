@@ -13,6 +13,7 @@ mod inspect;
 mod mesh;
 mod nominal;
 mod normals;
+mod person;
 mod probe;
 mod progress;
 mod reconstruct;
@@ -24,11 +25,8 @@ mod support_bundle;
 
 use std::process::ExitCode;
 
-use anyhow::Context;
-
 use crate::report::Report;
 use crate::report::wire;
-use crate::web;
 
 /// What `acies` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
@@ -69,6 +67,8 @@ pub enum Command {
     Calibrate(calibrate::Calibrate),
     /// Measure reference artefacts with a scanner: form, size, distance, flatness, edge; write a record.
     Acceptance(acceptance::Acceptance),
+    /// Add, list or disable those who may use a cell's page.
+    Person(person::People),
     /// List what is attached, who may open it, and why not.
     Devices(devices::Devices),
     /// Play one simulated device on a pseudo-terminal or a socket.
@@ -100,6 +100,7 @@ impl Command {
             Command::Replay(command) => command.run(),
             Command::Calibrate(command) => command.run(),
             Command::Acceptance(command) => command.run(),
+            Command::Person(command) => command.run(),
             Command::Devices(command) => command.run(),
             Command::Simulate(command) => command.run(),
         }
@@ -193,35 +194,6 @@ pub(crate) fn status_of(report: &Report) -> Status {
         wire::Status::NotOk => Status::NotOk,
         wire::Status::NotDecidable => Status::NotDecidable,
     }
-}
-
-/// Serves one report on `address` until the program is interrupted or told to end.
-pub(crate) fn serve_until_interrupted(address: &str, content: web::Content) -> Result<(), Failure> {
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build();
-    let runtime = runtime
-        .context("the page's runtime")
-        .map_err(Failure::Internal)?;
-    runtime.block_on(async {
-        let listener = tokio::net::TcpListener::bind(address)
-            .await
-            .with_context(|| {
-                format!("{address}: cannot listen; choose another address with --serve")
-            })
-            .map_err(Failure::Io)?;
-        let local = listener
-            .local_addr()
-            .context("the page's address")
-            .map_err(Failure::Io)?;
-        let (publisher, pages) = web::pages();
-        publisher.publish(content);
-        eprintln!("page: http://{local}/  (stop with Ctrl-C)");
-        web::serve(listener, pages, interrupted())
-            .await
-            .context("the page")
-            .map_err(Failure::Io)
-    })
 }
 
 /// Ends when the program is interrupted (Ctrl-C) or told to end (SIGTERM), so that ports and pages are given back.

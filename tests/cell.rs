@@ -303,6 +303,7 @@ impl Bench {
         let key = key.map(str::to_owned);
         self.runtime
             .block_on(self.handle.start(order, "anna", key, mode))
+            .map(|(inspection, _)| inspection)
     }
 
     fn command(&self, command: Command) {

@@ -6,8 +6,6 @@ mod forms;
 mod part;
 #[path = "report/schema.rs"]
 mod schema;
-#[path = "report/web.rs"]
-mod web;
 
 use acies::report::Report;
 

@@ -22,7 +22,8 @@ use super::status::{DeviceState, DeviceStatus, JobStatus, Snapshot};
 use super::{CellError, State};
 use crate::config::Cell;
 use crate::store::{
-    Finished, Inspection, Order, RecipeVersion, Retention, Store, StoreError, StoreLock, Trigger,
+    Finished, Inspection, Order, Phase, RecipeVersion, Retention, Store, StoreError, StoreLock,
+    Trigger,
 };
 
 /// How often the loop looks after what no event tells it.
@@ -96,8 +97,9 @@ pub enum Refusal {
     Ending,
 }
 
-/// What a trigger gets: the inspection it became, or the refusal, which is kept as an inspection too where the store can.
-pub type Started = Result<Inspection, (Refusal, Option<Box<Inspection>>)>;
+/// What a trigger gets: the inspection it became and whether that is new, or the refusal, which is kept as an inspection too
+/// where the store can.
+pub type Started = Result<(Inspection, bool), (Refusal, Option<Box<Inspection>>)>;
 
 /// Everything that can happen.
 pub(super) enum Event {
@@ -636,21 +638,21 @@ impl Running {
             let kept = self.store.refuse(&trigger, &refusal.to_string(), now);
             return match kept {
                 // The trigger was repeated, and taken the first time.
-                Ok(known) if known.phase != crate::store::Phase::Refused => Ok(known),
+                Ok(known) if known.phase != Phase::Refused => Ok((known, false)),
                 Ok(refused) => Err((refusal, Some(Box::new(refused)))),
                 Err(_) => Err((refusal, None)),
             };
         }
         let (inspection, new) = self.store.queue(&trigger, now).map_err(failed)?;
         if !new {
-            return Ok(inspection);
+            return Ok((inspection, false));
         }
         if mode == Mode::Continuous {
             self.snapshot.mode = Mode::Continuous;
             self.continuous = Some((order, operator.to_owned(), 1));
         }
         self.queue.push_back(Job::new(&inspection));
-        Ok(inspection)
+        Ok((inspection, true))
     }
 
     fn command(&mut self, command: Command, person: &str) -> Result<(), Refusal> {
