@@ -834,3 +834,46 @@ fn a_store_of_a_newer_program_or_of_another_is_refused() {
     let error = Store::open(&folder.0).expect_err("no database");
     assert!(error.to_string().contains("acies.db"), "{error}");
 }
+
+#[cfg(feature = "parquet")]
+#[test]
+fn parquet_holds_every_station_of_every_result() {
+    use parquet::file::reader::{FileReader, SerializedFileReader};
+    use parquet::record::RowAccessor;
+
+    let folder = Folder::new("parquet");
+    let store = Store::open(&folder.0).expect("a store");
+    for number in 0..3 {
+        measure(&store, &format!("A-{number}"), Status::Ok, number);
+    }
+    let path = folder.join("stations.parquet");
+    let mut file = fs::File::create(&path).expect("a file");
+    let written = store
+        .export(Export::Parquet, &History::default(), &mut file)
+        .expect("exported");
+    assert_eq!(written, 3);
+    let report = report(Status::Ok);
+    let stations: Vec<_> = report
+        .edges
+        .iter()
+        .flat_map(|edge| &edge.stations)
+        .collect();
+    let reader =
+        SerializedFileReader::new(fs::File::open(&path).expect("the file")).expect("Parquet");
+    let rows: Vec<_> = reader
+        .get_row_iter(None)
+        .expect("rows")
+        .map(|row| row.expect("a row"))
+        .collect();
+    assert_eq!(rows.len(), 3 * stations.len());
+    for (row, station) in rows.iter().zip(stations) {
+        assert_eq!(row.get_long(0).expect("an inspection"), 3, "newest first");
+        assert_eq!(row.get_string(1).expect("a part"), "A-2");
+        assert_eq!(row.get_double(5).expect("a place"), station.s_mm);
+        assert_eq!(
+            row.get_double(9).ok(),
+            station.d1_mm,
+            "not measured is null"
+        );
+    }
+}
