@@ -20,6 +20,7 @@ use crate::points::PointCloud;
 
 pub use assembler::Assembler;
 pub use carried::{Carrier, CarrierPlan, scan_carried};
+pub(crate) use run::chain;
 pub use run::{Profiling, ScanError, ScanEvent, ScanPlan, ScanWatch, scan};
 
 /// Where a profiler is, and how it moves relative to the part.

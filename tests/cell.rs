@@ -647,6 +647,14 @@ fn a_wrong_recipe_leaves_the_last_good_one_active() {
         (newest.person.as_str(), newest.action.as_str()),
         ("configuration", "recipe.activate")
     );
+    fs::write(&file, &text).expect("as it was at first");
+    bench.handle.reload().expect("reloaded");
+    bench.until("the first again", |snapshot| {
+        snapshot
+            .recipe
+            .as_ref()
+            .is_some_and(|recipe| recipe.id == good.id)
+    });
 }
 
 #[test]

@@ -8,6 +8,7 @@ use std::time::Duration;
 use acies_drivers::device::{Identity, Instrument, Setup};
 use acies_drivers::link::Links;
 
+pub(super) use crate::acquire::chain;
 use crate::config::Cell;
 
 /// First wait after a failure; doubled up to [`WAIT_MAX`] while it goes on failing.
@@ -199,19 +200,4 @@ fn pause(wait: Duration, requests: &Receiver<Request>) -> bool {
             Err(RecvTimeoutError::Disconnected) => return false,
         }
     }
-}
-
-/// An error with its causes, on one line.
-pub(super) fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(inner) = cause {
-        // Some errors say their cause themselves; once is enough.
-        let more = inner.to_string();
-        if !text.contains(&more) {
-            text = format!("{text}: {more}");
-        }
-        cause = inner.source();
-    }
-    text
 }

@@ -17,9 +17,9 @@ pub(super) struct Prepared {
     pub problem: String,
 }
 
-/// Takes the configured recipe and nominal into the store where their content is new there, and reads the active version.
+/// Takes the configured recipe and nominal into the store where the files have changed, and reads the active version.
 ///
-/// Content that the store has already is not activated again: somebody may have activated another version since.
+/// Files that are as they were when they were last taken change nothing: somebody may have activated another version since.
 ///
 /// # Errors
 /// [`CellError::Store`] only; a recipe that cannot be read is [`Prepared::problem`].
@@ -54,7 +54,7 @@ pub(super) fn prepare(cell: &Cell, store: &Store, now: SystemTime) -> Result<Pre
     Ok(Prepared { active, problem })
 }
 
-/// Takes the configured files into the store and activates them where they are new there; then they have been read as well.
+/// Takes the configured files into the store and activates them where they have changed; then they have been read as well.
 fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<Option<(i64, Part)>, CellError> {
     let read = |path: &std::path::Path| {
         std::fs::read(path).map_err(|source| CellError::RecipeFile {
@@ -88,8 +88,7 @@ fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<Option<(i64, Part
         author: "configuration",
         why: "the configured files",
     };
-    let known = store.known_recipe(&new)?;
-    if known && store.active_recipe()?.is_some() {
+    if store.is_configured(&new)? && store.active_recipe()?.is_some() {
         return Ok(None);
     }
     // Checked before it is taken: what the store holds can be read.
@@ -100,6 +99,7 @@ fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<Option<(i64, Part
     };
     let version = store.add_recipe(&new, now)?;
     store.activate_recipe(version.id, new.author, new.why, now)?;
+    store.note_configured(&new)?;
     Ok(Some((version.id, part)))
 }
 

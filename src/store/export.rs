@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use super::{History, Inspection, Store, StoreError};
+use super::{History, Inspection, Phase, Store, StoreError};
 use crate::report::Report;
 
 /// In which form.
@@ -23,6 +23,15 @@ pub enum ExportError {
     /// The store.
     #[error(transparent)]
     Store(#[from] StoreError),
+    /// A stored report.
+    #[error("the report of inspection {id}: {source}; it is damaged, restore it from a backup")]
+    Report {
+        /// Whose.
+        id: i64,
+        /// What is wrong with it.
+        #[source]
+        source: serde_json::Error,
+    },
     /// Where it was to go.
     #[error("the export cannot be written: {0}")]
     Write(#[from] io::Error),
@@ -60,14 +69,9 @@ impl Store {
             Export::Csv => {
                 let mut table = csv::Writer::from_writer(&mut *out);
                 table.write_record(HEADINGS)?;
-                let written =
-                    self.each_report(
-                        history,
-                        &mut |inspection, json| match serde_json::from_str::<Report>(json) {
-                            Ok(report) => Ok(rows(&mut table, inspection, &report)?),
-                            Err(_) => Ok(()),
-                        },
-                    )?;
+                let written = self.each_report(history, &mut |inspection, json| {
+                    Ok(rows(&mut table, inspection, &parsed(inspection, json)?)?)
+                })?;
                 table.flush()?;
                 written
             }
@@ -96,14 +100,22 @@ impl Store {
             };
             page.before = Some(last.id);
             for inspection in &inspections {
-                // An inspection without a result has no report.
-                if let Ok(json) = self.report_json(inspection.id) {
-                    show(inspection, &json)?;
+                // Only what is done has a result; one that cannot be read is an error and no gap.
+                if inspection.phase == Phase::Done {
+                    show(inspection, &self.report_json(inspection.id)?)?;
                     shown += 1;
                 }
             }
         }
     }
+}
+
+/// The report in `json`, which belongs to `inspection`.
+pub(super) fn parsed(inspection: &Inspection, json: &str) -> Result<Report, ExportError> {
+    serde_json::from_str(json).map_err(|source| ExportError::Report {
+        id: inspection.id,
+        source,
+    })
 }
 
 const HEADINGS: [&str; 16] = [

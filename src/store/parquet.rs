@@ -9,7 +9,7 @@ use parquet::file::properties::WriterProperties;
 use parquet::file::writer::{SerializedFileWriter, SerializedRowGroupWriter};
 use parquet::schema::parser::parse_message_type;
 
-use super::export::ExportError;
+use super::export::{ExportError, parsed};
 use super::inspections::status_word;
 use super::{History, Store};
 use crate::report::Report;
@@ -66,10 +66,7 @@ impl Store {
         let mut file = SerializedFileWriter::new(out, schema, Arc::new(properties.build()))?;
         let mut rows = Rows::default();
         let written = self.each_report(history, &mut |inspection, json| {
-            let Ok(report) = serde_json::from_str::<Report>(json) else {
-                return Ok(());
-            };
-            rows.add(inspection, &report);
+            rows.add(inspection, &parsed(inspection, json)?);
             if rows.inspection.len() >= ROWS {
                 std::mem::take(&mut rows).write(&mut file)?;
             }

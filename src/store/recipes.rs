@@ -140,17 +140,32 @@ impl Store {
         })
     }
 
-    /// Whether this content was ever added under this name.
+    /// Whether this is the content that the configured files had when they were last taken.
     ///
     /// # Errors
     /// [`StoreError::Database`].
-    pub fn known_recipe(&self, new: &NewRecipe<'_>) -> Result<bool, StoreError> {
+    pub fn is_configured(&self, new: &NewRecipe<'_>) -> Result<bool, StoreError> {
         self.read(|connection| {
             connection.query_row(
-                "SELECT EXISTS (SELECT 1 FROM recipes WHERE name = ?1 AND sha256 = ?2)",
-                [new.name, &new.sha256()],
+                "SELECT EXISTS (SELECT 1 FROM settings WHERE name = 'configured_recipe' AND value = ?1)",
+                [new.sha256()],
                 |row| row.get(0),
             )
+        })
+    }
+
+    /// Notes that the configured files have this content.
+    ///
+    /// # Errors
+    /// [`StoreError::Database`].
+    pub fn note_configured(&self, new: &NewRecipe<'_>) -> Result<(), StoreError> {
+        self.write(|connection| {
+            connection.execute(
+                "INSERT INTO settings (name, value) VALUES ('configured_recipe', ?1)
+                 ON CONFLICT (name) DO UPDATE SET value = excluded.value",
+                [new.sha256()],
+            )?;
+            Ok(())
         })
     }
 

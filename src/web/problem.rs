@@ -11,6 +11,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 use utoipa::ToSchema;
 
+pub(super) use crate::acquire::chain;
 use crate::cell::{CellError, Refusal};
 use crate::store::{Inspection, StoreError};
 
@@ -219,20 +220,6 @@ impl From<CellError> for Problem {
             other => Self::fault(chain(&other)),
         }
     }
-}
-
-/// An error with its causes, each said once.
-pub(super) fn chain(error: &dyn std::error::Error) -> String {
-    let mut text = error.to_string();
-    let mut cause = error.source();
-    while let Some(inner) = cause {
-        let more = inner.to_string();
-        if !text.contains(&more) {
-            text = format!("{text}: {more}");
-        }
-        cause = inner.source();
-    }
-    text
 }
 
 /// A JSON body.
