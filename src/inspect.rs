@@ -5,6 +5,7 @@
 
 pub mod align;
 pub mod assign;
+mod attention;
 pub mod body;
 pub mod characteristic;
 mod clusters;
@@ -18,7 +19,9 @@ pub mod flank;
 pub mod form;
 mod from_pmi;
 pub mod gap;
+mod growing;
 pub mod measure;
+mod measuring;
 pub mod monte_carlo;
 pub mod quantity;
 pub mod recipe;
@@ -32,24 +35,26 @@ use glam::DVec3;
 
 pub use align::{AlignOptions, Start, Touch};
 pub use body::Body;
+pub use growing::{EdgeSoFar, Growing};
 pub use monte_carlo::MonteCarlo;
 pub use recipe::Recipe;
 pub use result::Inspection;
 
-use align::{Aligned, Scan, align};
+use align::{Aligned, DatumFeature, Scan, align};
 use assign::Surface;
+use attention::{Outline, Patches};
 use body::BodyEdge;
 use characteristic::{EdgeValues, at_station, characteristics};
+use compare::Scanned;
 use corner::CornerSettings;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges_stepped};
-use monte_carlo::measure_edges_drawn;
+use monte_carlo::{Trials, measure_edges_drawn};
 use quantity::{Extent, Limits, Quantity};
 use recipe::{EdgeFacts, EdgeKey, Resolved};
-use result::{EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
+use result::{Alignment, EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
 use verdict::judge;
 
-use crate::features::{self, Method};
-use crate::points::{Frame, Neighbors, PointCloud, noise_mm, spacing};
+use crate::points::{Frame, Neighbors, PointCloud, Spacing, noise_mm, spacing};
 
 /// Share of the part's half-diagonal beyond which a point belongs to something else.
 const GATE: f64 = 0.1;
@@ -112,28 +117,15 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     stages.begin("alignment");
     let surface = Surface::new(nominal);
     let mut findings = Vec::new();
-    let datums = datum_faces(nominal, &request.recipe.datum_faces, &mut findings);
-    let (features, unknown) = datums::datum_features(nominal, &request.recipe.datums);
-    findings.extend(unknown.iter().map(|datum| {
-        format!(
-            "recipe: alignment: datum {:?}: {}, expected {}; nothing is decided without it",
-            datum.name, datum.found, datum.expected
-        )
-    }));
-    let options = AlignOptions {
-        datum_faces: &datums,
-        datums: if unknown.is_empty() { &features } else { &[] },
-        touches: request.touches,
-        held: request.recipe.held,
-        ..AlignOptions::default()
-    };
+    let datums = Datums::of(nominal, request.recipe, &mut findings);
+    let options = datums.options(request);
     let Aligned {
         mut alignment,
         findings: of_alignment,
         ..
     } = align(&scan, &surface, request.start, &options);
     findings.extend(of_alignment);
-    if !unknown.is_empty() {
+    if datums.unknown {
         alignment.status = Verdict::NotDecidable;
     }
 
@@ -144,16 +136,8 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let places = surface.places(&part, GATE * 0.5 * (high - low).length());
     stages.begin("edges");
     let settings = MeasureSettings {
-        along_mm: scan.spacing.along_mm,
-        across_mm: scan.spacing.across_mm,
-        noise_mm: scan.noise_mm,
-        station_step_mm: request.recipe.station_step_mm,
         pose_covariance: alignment.covariance,
-        u_calibration_mm: request.recipe.u_calibration_mm,
-        u_calibration_rad: request.recipe.u_calibration_rad,
-        flank_mm: request.recipe.flank_mm,
-        depth_mm: request.recipe.depth_mm,
-        expansion: expansion(request, &mut findings),
+        ..measure_settings(&scan.spacing, scan.noise_mm, request, &mut findings)
     };
     let facts = all_edge_facts(nominal);
     let (resolved, of_recipe) = resolve(nominal, &facts, request.recipe);
@@ -172,15 +156,119 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         }
     };
     stages.begin("comparison of edges found");
-    let known = (scan.spacing, scan.noise_mm);
-    let detection = features::detect_knowing(cloud, &neighbors, known, Method::Adaptive);
     let edges = nominal.edges();
-    let compared = compare::compare(&part, &detection, nominal, (&edges, &measured));
+    let outline = Outline::new(nominal, &edges, compare::near_mm(&scan.spacing));
+    let mut patches = Patches::default();
+    patches.add(&part.positions, &places, &outline);
+    let scanned = Scanned {
+        clouds: &[&part],
+        patches: &patches,
+        outline: &outline,
+        spacing: scan.spacing,
+        noise_mm: scan.noise_mm,
+    };
+    let compared = compare::compare(&scanned, (&edges, &measured));
+    let taken = Taken {
+        alignment,
+        findings,
+        measured,
+        compared,
+        trials,
+        estimate: ScanEstimate {
+            spacing: scan.spacing,
+            noise_mm: scan.noise_mm,
+        },
+    };
+    judge_all(nominal, request, (&edges, &resolved), taken, stages)
+}
 
+/// What the recipe says that the pose rests on.
+struct Datums {
+    faces: Vec<u32>,
+    features: Vec<DatumFeature>,
+    /// Whether a feature that is asked for is not in the nominal.
+    unknown: bool,
+}
+
+impl Datums {
+    fn of<B: Body>(nominal: &B, recipe: &Recipe, findings: &mut Vec<String>) -> Self {
+        let faces = datum_faces(nominal, &recipe.datum_faces, findings);
+        let (features, unknown) = datums::datum_features(nominal, &recipe.datums);
+        findings.extend(unknown.iter().map(|datum| {
+            format!(
+                "recipe: alignment: datum {:?}: {}, expected {}; nothing is decided without it",
+                datum.name, datum.found, datum.expected
+            )
+        }));
+        Self {
+            faces,
+            features,
+            unknown: !unknown.is_empty(),
+        }
+    }
+
+    fn options<'a>(&'a self, request: &Request<'a>) -> AlignOptions<'a> {
+        AlignOptions {
+            datum_faces: &self.faces,
+            datums: if self.unknown { &[] } else { &self.features },
+            touches: request.touches,
+            held: request.recipe.held,
+            ..AlignOptions::default()
+        }
+    }
+}
+
+/// What is measured with, but for the covariance of the pose.
+fn measure_settings(
+    spacing: &Spacing,
+    noise_mm: f64,
+    request: &Request<'_>,
+    findings: &mut Vec<String>,
+) -> MeasureSettings {
+    let recipe = request.recipe;
+    MeasureSettings {
+        along_mm: spacing.along_mm,
+        across_mm: spacing.across_mm,
+        noise_mm,
+        station_step_mm: recipe.station_step_mm,
+        pose_covariance: [[0.0; 6]; 6],
+        u_calibration_mm: recipe.u_calibration_mm,
+        u_calibration_rad: recipe.u_calibration_rad,
+        flank_mm: recipe.flank_mm,
+        depth_mm: recipe.depth_mm,
+        expansion: expansion(request, findings),
+    }
+}
+
+/// What was measured of a part, not judged yet.
+struct Taken {
+    alignment: Alignment,
+    findings: Vec<String>,
+    measured: Vec<MeasuredEdge>,
+    compared: compare::Compared,
+    trials: Option<Trials>,
+    estimate: ScanEstimate,
+}
+
+/// Compares what was measured with the limits of the recipe.
+fn judge_all<B: Body>(
+    nominal: &B,
+    request: &Request<'_>,
+    (edges, resolved): (&[BodyEdge], &[Resolved]),
+    taken: Taken,
+    stages: Stages<'_>,
+) -> Inspection {
+    let Taken {
+        alignment,
+        mut findings,
+        measured,
+        compared,
+        ..
+    } = taken;
     let results: Vec<EdgeResult> = edges
         .iter()
         .zip(measured)
-        .zip(&resolved)
+        .zip(resolved)
         .map(|((edge, measured), asked)| {
             findings.extend(measured.remarks.iter().cloned());
             judged(edge, measured, asked, request.recipe)
@@ -188,8 +276,8 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         .collect();
     let corners = corner::measure(
         nominal,
-        &corner::corners(nominal, &edges),
-        (&edges, &results),
+        &corner::corners(nominal, edges),
+        (edges, &results),
         &CornerSettings {
             limit_mm: request.recipe.corner_mm,
             rule: request.recipe.rule,
@@ -197,7 +285,7 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
             u_calibration_mm: request.recipe.u_calibration_mm,
         },
     );
-    let gaps = gaps(&edges, &results, request.recipe, &mut findings);
+    let gaps = gaps(edges, &results, request.recipe, &mut findings);
     let values = results
         .iter()
         .map(|e| e.verdict)
@@ -205,8 +293,8 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         .chain(gaps.iter().map(|g| g.verdict))
         .chain(compared_verdict(
             &compared,
-            &resolved,
-            &edges,
+            resolved,
+            edges,
             request.recipe,
         ))
         .chain(environment_verdict(request, &mut findings));
@@ -219,14 +307,10 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         unexpected_edges: compared.unexpected,
         missing_edges: compared.missing,
         verdict,
-        trials,
+        trials: taken.trials,
         seconds: stages.end(),
         findings,
-        scan: Some(ScanEstimate {
-            spacing: scan.spacing,
-            noise_mm: scan.noise_mm,
-            classes: detection.classes,
-        }),
+        scan: Some(taken.estimate),
     }
 }
 

@@ -17,7 +17,8 @@ use super::progress::CellProgress;
 use super::{Failure, Status, print_line, status_of};
 use crate::cell::{self, CellError, Outcome};
 use crate::config::Cell;
-use crate::points::write_scan;
+use crate::features::{self, Method};
+use crate::points::{Neighbors, write_scan};
 use crate::report::{Report, print_table, to_ply};
 use crate::store::Order;
 
@@ -140,12 +141,9 @@ impl Demo {
         let cloud = &outcome.scan.cloud;
         write_scan(&self.output.join("scan.ply"), cloud)
             .map_err(|error| Failure::Io(error.into()))?;
-        let classes = outcome
-            .inspection
-            .scan
-            .iter()
-            .flat_map(|scan| &scan.classes);
-        let features: Vec<u8> = classes.map(|&class| class as u8).collect();
+        let neighbors = Neighbors::new(&cloud.positions);
+        let classes = features::detect(cloud, &neighbors, Method::Adaptive).classes;
+        let features: Vec<u8> = classes.iter().map(|&class| class as u8).collect();
         let coloured = to_ply(cloud, &features).map_err(|error| Failure::Internal(error.into()))?;
         let path = self.output.join("edges.ply");
         crate::points::write::write_atomically(&path, &coloured)

@@ -9,6 +9,7 @@
 //! the scan off the nominal, or that fits a mirrored scan better is no answer. Where datum features are asked for, the pose then moves
 //! onto them.
 
+mod again;
 mod check;
 pub mod datum;
 mod features;
@@ -32,6 +33,7 @@ use form::{form, patch_of};
 use scene::Scene;
 use search::Pose;
 
+pub(super) use again::{LaidPoint, align_again};
 pub use datum::{Datum, DatumPose, pose_from_datums, pose_from_ordered_datums};
 pub use features::{DatumFeature, DatumPlace};
 pub use twist::Twist;
@@ -162,24 +164,36 @@ pub fn align<B: Body>(
     start: Start,
     options: &AlignOptions<'_>,
 ) -> Aligned {
-    let task = Task {
-        scan,
-        surface,
-        options,
-        size_mm: surface.size_mm(),
-        origin: match start {
-            Start::Rough(pose) => pose,
-            _ => RigidTransform::IDENTITY,
-        },
-    };
+    align_keeping(scan, surface, start, options).0
+}
+
+/// Poses that a search ended at, best first, with what the data did not hold.
+pub(super) type Candidates = Vec<(RigidTransform, Vec<Twist>)>;
+
+/// As [`align`], with the poses that fitted, for [`align_again`].
+pub(super) fn align_keeping<B: Body>(
+    scan: &Scan<'_>,
+    surface: &Surface<'_, B>,
+    start: Start,
+    options: &AlignOptions<'_>,
+) -> (Aligned, Candidates) {
+    let task = Task::new(scan, surface, start, options);
     let holds = options.held.contains(&true);
     match start {
-        Start::None => task.as_it_lies(),
-        Start::Auto if holds => task.failed(
-            "alignment: held degrees of freedom but no start, expected the pose they are held at; give a rough start"
-                .to_string(),
-        ),
-        _ => task.on_datums(task.find(start, holds)),
+        Start::None => (task.as_it_lies(), Vec::new()),
+        Start::Auto if holds => {
+            let aligned = task.failed(
+                "alignment: held degrees of freedom but no start, expected the pose they are held at; give a rough start"
+                    .to_string(),
+            );
+            (aligned, Vec::new())
+        }
+        _ => {
+            let scene = Scene::new(scan);
+            let poses = task.find(&scene, start, holds);
+            let known = poses.iter().map(|p| (p.pose, p.weak.clone())).collect();
+            (task.on_datums(task.follow(&scene, &poses, start)), known)
+        }
     }
 }
 
@@ -247,7 +261,25 @@ struct Task<'a, B: Body> {
     origin: RigidTransform,
 }
 
-impl<B: Body> Task<'_, B> {
+impl<'a, B: Body> Task<'a, B> {
+    fn new(
+        scan: &'a Scan<'a>,
+        surface: &'a Surface<'a, B>,
+        start: Start,
+        options: &'a AlignOptions<'a>,
+    ) -> Self {
+        Self {
+            scan,
+            surface,
+            options,
+            size_mm: surface.size_mm(),
+            origin: match start {
+                Start::Rough(pose) => pose,
+                _ => RigidTransform::IDENTITY,
+            },
+        }
+    }
+
     /// A best fit on the faces asked for, without anything found.
     fn unexplained(&self) -> Alignment {
         let faces = self.options.datum_faces.iter();
@@ -307,40 +339,36 @@ impl<B: Body> Task<'_, B> {
         }
     }
 
-    /// Searches, follows the best pose down to all points, and judges it.
-    fn find(&self, start: Start, holds: bool) -> Aligned {
-        let scene = Scene::new(self.scan);
+    /// The poses that the scene fits, best first; none where too few points lie near the nominal.
+    fn find(&self, scene: &Scene, start: Start, holds: bool) -> Vec<Pose> {
         let mut poses = if holds {
             Vec::new()
         } else {
-            search::search(self, &scene, start)
+            search::search(self, scene, start)
         };
-        if let Start::Rough(pose) = start {
-            let Some((pose, weak)) = self.coarse(pose, COARSE_POINTS, 0.3 * self.size_mm) else {
-                if poses.is_empty() {
-                    return self.failed(TOO_FEW.to_string());
-                }
-                return self.follow(&scene, poses, start);
-            };
+        if let Start::Rough(pose) = start
+            && let Some((pose, weak)) = self.coarse(pose, COARSE_POINTS, 0.3 * self.size_mm)
+        {
             let fit = scene.fit(&pose, self.surface, self.cap_mm());
             let better = poses
                 .first()
                 .is_some_and(|p| p.fit.is_better(&fit, self.scan.noise_mm));
             // Where several fit the start decides.
-            let place = usize::from(better);
+            let place = usize::from(better).min(poses.len());
             poses.insert(place, Pose { pose, fit, weak });
         }
-        if poses.is_empty() {
-            return self.failed(
-                "alignment: no pose of the scan fits the nominal; give a rough start".to_string(),
-            );
-        }
-        self.follow(&scene, poses, start)
+        poses
     }
 
     /// From the first of `poses` down to all points; the others are its rivals.
-    fn follow(&self, scene: &Scene, poses: Vec<Pose>, start: Start) -> Aligned {
-        let best = poses[0].pose;
+    fn follow(&self, scene: &Scene, poses: &[Pose], start: Start) -> Aligned {
+        let Some(best) = poses.first().map(|p| p.pose) else {
+            return self.failed(match start {
+                Start::Rough(_) => TOO_FEW.to_string(),
+                _ => "alignment: no pose of the scan fits the nominal; give a rough start"
+                    .to_string(),
+            });
+        };
         let Some((pose, _)) = self.coarse(best, COARSE_POINTS, 0.1 * self.size_mm) else {
             return self.failed(TOO_FEW.to_string());
         };
@@ -348,22 +376,36 @@ impl<B: Body> Task<'_, B> {
             return self.failed(TOO_FEW.to_string());
         };
         let mut aligned = self.described(pose, &observations, &step);
-        self.check(scene, &poses, start, &step, &mut aligned);
+        self.check(scene, poses, start, &step, &mut aligned);
         aligned
+    }
+
+    /// Distance from the nominal within which points are looked at, and from an edge without which they are not, mm; `inner` tells how
+    /// many points there are for both, and for the first alone.
+    fn gates(&self, along_mm: f64, inner: impl Fn(f64, f64) -> usize) -> (f64, f64) {
+        // Wide enough that a face which is off stays in sight and is counted as form.
+        let gate = (0.05 * self.size_mm).max(10.0 * self.scan.noise_mm);
+        let rim = (RIM_SPACINGS * along_mm).min(0.02 * self.size_mm);
+        // A part of nothing but narrow faces is all rim.
+        if inner(gate, rim) * 3 < inner(gate, 0.0) {
+            (gate, 0.0)
+        } else {
+            (gate, rim)
+        }
+    }
+
+    fn holds(&self, face: u32) -> bool {
+        face != NO_FACE
+            && (self.options.datum_faces.is_empty() || self.options.datum_faces.contains(&face))
     }
 
     /// The pose by some points until it stands, then by all.
     fn fine(&self, start: RigidTransform) -> Option<(RigidTransform, Vec<Observation>, Step)> {
         let mut pose = start;
         let some = self.scan.subset(FINE_POINTS);
-        // Wide enough that a face which is off stays in sight and is counted as form.
-        let gate = (0.05 * self.size_mm).max(10.0 * self.scan.noise_mm);
-        let mut rim = (RIM_SPACINGS * self.scan.spacing.along_mm).min(0.02 * self.size_mm);
-        // A part of nothing but narrow faces is all rim.
-        let inner = self.observe(&pose, &some, gate, rim).len();
-        if inner * 3 < self.observe(&pose, &some, gate, 0.0).len() {
-            rim = 0.0;
-        }
+        let along_mm = self.scan.spacing.along_mm;
+        let (gate, rim) =
+            self.gates(along_mm, |gate, rim| self.observe(&pose, &some, gate, rim).len());
         for _ in 0..12 {
             let step = self.solve(&self.observe(&pose, &some, gate, rim))?;
             pose = self.moved(&step.twist, pose);
@@ -424,10 +466,6 @@ impl<B: Body> Task<'_, B> {
     ) -> Vec<Observation> {
         let cloud = self.scan.cloud;
         let turn = DMat3::from_quat(pose.rotation);
-        let holds = |face: u32| {
-            face != NO_FACE
-                && (self.options.datum_faces.is_empty() || self.options.datum_faces.contains(&face))
-        };
         let of = |point: DVec3,
                   view: Option<DVec3>,
                   (u_mm, rim_mm): (f64, f64),
@@ -435,7 +473,7 @@ impl<B: Body> Task<'_, B> {
             let p = turn * point + pose.translation;
             let view = view.map(|v| turn * v);
             let (place, rim) = self.surface.place_and_rim(p, view, gate_mm, found);
-            (holds(place.face) && rim >= rim_mm).then_some(Observation {
+            (self.holds(place.face) && rim >= rim_mm).then_some(Observation {
                 point: p,
                 normal: place.normal,
                 residual_mm: place.deviation_mm,

@@ -8,8 +8,8 @@ use super::body::{Body, BodyEdge};
 use super::edge_break::ZonePoint;
 use super::flank::{FlankPoint, FlankPoints, NO_LINE, Windows};
 use crate::nominal::Station;
-use crate::points::PointCloud;
 use crate::points::neighbors::Neighbors;
+use crate::points::{Origin, PointCloud};
 
 /// Points that one task looks at.
 const BLOCK: usize = 8192;
@@ -95,61 +95,152 @@ impl Track {
     }
 }
 
-/// What [`flanks`] works on.
-pub(super) struct Scene<'a> {
-    pub(super) cloud: &'a PointCloud,
-    pub(super) places: &'a [Place],
-    pub(super) edges: &'a [BodyEdge],
-    pub(super) tracks: &'a [Track],
-    /// How far from an edge its flanks are collected, mm, by edge.
-    pub(super) radius_mm: &'a [f64],
-    /// Indices of the points by face.
-    pub(super) by_face: &'a [Vec<u32>],
+/// The tracks of all edges, and which of them border a face.
+pub(super) struct Tracks {
+    tracks: Vec<Track>,
+    /// By face: (edge, side).
+    of_face: Vec<Vec<(usize, usize)>>,
 }
 
-/// The points of every face: for face f the indices of its points.
-pub(super) fn by_face(places: &[Place], faces: usize) -> Vec<Vec<u32>> {
-    let mut lists = vec![Vec::new(); faces];
-    for (i, place) in places.iter().enumerate() {
-        if place.face != NO_FACE {
-            lists[place.face as usize].push(i as u32);
+impl Tracks {
+    pub(super) fn new<B: Body>(body: &B, edges: &[BodyEdge], windows: &[Windows]) -> Self {
+        let mut of_face: Vec<Vec<(usize, usize)>> = vec![Vec::new(); body.face_count()];
+        for (e, edge) in edges.iter().enumerate() {
+            for (side, face) in edge.faces.iter().enumerate() {
+                of_face[*face as usize].push((e, side));
+            }
+        }
+        let track = |e: usize| Track::new(body, e, &edges[e], &windows[e]);
+        Self {
+            tracks: (0..edges.len()).into_par_iter().map(track).collect(),
+            of_face,
         }
     }
-    lists
 }
 
-/// The points of the two flanks of every edge of `wanted`, in that order.
+/// A point as seen from an edge in whose reach it lies.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Sight {
+    /// Index of the point in its layer.
+    point: u32,
+    edge: u32,
+    /// Which of the edge's faces the point is on.
+    side: u8,
+    /// Whether it lies beside the edge, not beyond an end of it.
+    beside: bool,
+    line: u32,
+    s: f64,
+    r: f64,
+    /// Distance from the edge, mm.
+    distance: f64,
+    /// From the face, mm.
+    deviation: f64,
+}
+
+/// Aligned points with what is known of each.
+pub(super) struct Layer<'a> {
+    /// In the part frame, mm.
+    pub(super) positions: &'a [DVec3],
+    pub(super) origins: &'a [Origin],
+    pub(super) places: &'a [Place],
+}
+
+impl<'a> Layer<'a> {
+    pub(super) fn new(cloud: &'a PointCloud, places: &'a [Place]) -> Self {
+        Self {
+            positions: &cloud.positions,
+            origins: &cloud.origins,
+            places,
+        }
+    }
+
+    /// How the points are seen from every edge within `radius_mm[edge]` of them: a point after the other.
+    pub(super) fn sights(&self, tracks: &Tracks, radius_mm: &[f64]) -> Vec<Sight> {
+        let block = |first: usize| {
+            let last = (first + BLOCK).min(self.places.len());
+            let (mut found, mut sights) = (Vec::new(), Vec::new());
+            for i in first..last {
+                let place = &self.places[i];
+                if place.face == NO_FACE {
+                    continue;
+                }
+                let p = self.positions[i];
+                for &(edge, side) in &tracks.of_face[place.face as usize] {
+                    let track = &tracks.tracks[edge];
+                    let radius = radius_mm[edge];
+                    let Some(seen) = track.seen(p, side, radius, &mut found) else {
+                        continue;
+                    };
+                    if seen.distance > radius {
+                        continue;
+                    }
+                    sights.push(Sight {
+                        point: i as u32,
+                        edge: edge as u32,
+                        side: side as u8,
+                        beside: track.covers(seen.s),
+                        line: self.line(i),
+                        s: seen.s,
+                        r: seen.r,
+                        distance: seen.distance,
+                        deviation: place.deviation_mm,
+                    });
+                }
+            }
+            sights
+        };
+        let firsts: Vec<usize> = (0..self.places.len()).step_by(BLOCK).collect();
+        let blocks: Vec<Vec<Sight>> = firsts.into_par_iter().map(block).collect();
+        blocks.concat()
+    }
+
+    /// The scan line of a point, one number for a profile of a view.
+    fn line(&self, i: usize) -> u32 {
+        match self.origins.get(i) {
+            Some(origin) => (u32::from(origin.view) << 24 ^ origin.profile).min(NO_LINE - 1),
+            None => NO_LINE,
+        }
+    }
+}
+
+/// The points of the two flanks of every edge of `wanted`, in that order, within `radius_mm[edge]`, from the sights of all layers.
 ///
 /// A point within the transition zone of another edge of its face, `cuts_mm[edge][side]` wide, is left out.
 pub(super) fn flanks(
-    scene: &Scene<'_>,
+    layers: &[&[Sight]],
     wanted: &[usize],
     cuts_mm: &[[f64; 2]],
+    radius_mm: &[f64],
 ) -> Vec<[FlankPoints; 2]> {
-    let mut sides_of_face: Vec<Vec<(usize, usize)>> = vec![Vec::new(); scene.by_face.len()];
-    for (e, edge) in scene.edges.iter().enumerate() {
-        for (side, face) in edge.faces.iter().enumerate() {
-            sides_of_face[*face as usize].push((e, side));
-        }
-    }
-    let needed = |face: usize| sides_of_face[face].iter().any(|(e, _)| wanted.contains(e));
-    let tasks: Vec<(usize, &[u32])> = (0..scene.by_face.len())
-        .filter(|face| needed(*face))
-        .flat_map(|face| scene.by_face[face].chunks(BLOCK).map(move |c| (face, c)))
-        .collect();
-    let blocks: Vec<Vec<(usize, usize, FlankPoint)>> = tasks
-        .par_iter()
-        .map(|(face, block)| block_of(scene, &sides_of_face[*face], block, cuts_mm))
-        .collect();
-    let mut place_of = vec![usize::MAX; scene.edges.len()];
+    let mut place_of = vec![usize::MAX; cuts_mm.len()];
     for (k, e) in wanted.iter().enumerate() {
         place_of[*e] = k;
     }
-    let mut lists: Vec<[Vec<FlankPoint>; 2]> = vec![[Vec::new(), Vec::new()]; wanted.len()];
-    for (edge, side, point) in blocks.into_iter().flatten() {
-        if place_of[edge] != usize::MAX {
-            lists[place_of[edge]][side].push(point);
+    let usable_of = |layer: &&[Sight]| {
+        let mut out: Vec<(usize, usize, FlankPoint)> = Vec::new();
+        for seen in layer.chunk_by(|a, b| a.point == b.point) {
+            for (k, own) in seen.iter().enumerate() {
+                let place = place_of[own.edge as usize];
+                let within = own.distance <= radius_mm[own.edge as usize];
+                if place == usize::MAX || own.r < 0.0 || !own.beside || !within {
+                    continue;
+                }
+                let disturbed = seen.iter().enumerate().any(|(j, other)| {
+                    j != k && other.distance < cuts_mm[other.edge as usize][other.side as usize]
+                });
+                if !disturbed {
+                    let point = (own.s, own.r, own.deviation, own.line);
+                    out.push((place, own.side as usize, point));
+                }
+            }
         }
+        out
+    };
+    let pieces: Vec<&[Sight]> = layers.iter().flat_map(|layer| split(layer)).collect();
+    let found: Vec<Vec<(usize, usize, FlankPoint)>> = pieces.par_iter().map(usable_of).collect();
+    let mut lists: Vec<[Vec<FlankPoint>; 2]> = vec![[Vec::new(), Vec::new()]; wanted.len()];
+    for (edge, side, point) in found.into_iter().flatten() {
+        lists[edge][side].push(point);
     }
     lists
         .into_par_iter()
@@ -157,111 +248,94 @@ pub(super) fn flanks(
         .collect()
 }
 
-fn block_of(
-    scene: &Scene<'_>,
-    sides: &[(usize, usize)],
-    block: &[u32],
-    cuts_mm: &[[f64; 2]],
-) -> Vec<(usize, usize, FlankPoint)> {
-    let mut found = Vec::new();
-    let mut seen: Vec<(usize, usize, Seen)> = Vec::new();
-    let mut out = Vec::new();
-    for &i in block {
-        let p = scene.cloud.positions[i as usize];
-        seen.clear();
-        for &(edge, side) in sides {
-            let radius = scene.radius_mm[edge];
-            if let Some(s) = scene.tracks[edge].seen(p, side, radius, &mut found) {
-                seen.push((edge, side, s));
-            }
+/// Pieces of about a block, none of which ends in the middle of a point.
+fn split(mut layer: &[Sight]) -> Vec<&[Sight]> {
+    let mut pieces = Vec::new();
+    while layer.len() > BLOCK {
+        let point = layer[BLOCK].point;
+        let at = layer.partition_point(|sight| sight.point < point);
+        if at == 0 {
+            break;
         }
-        for (k, (edge, side, own)) in seen.iter().enumerate() {
-            let usable = own.r >= 0.0
-                && own.distance <= scene.radius_mm[*edge]
-                && scene.tracks[*edge].covers(own.s);
-            let disturbed = || {
-                let mut others = seen.iter().enumerate().filter(|(j, _)| *j != k);
-                others.any(|(_, (e, s, other))| other.distance < cuts_mm[*e][*s])
-            };
-            if usable && !disturbed() {
-                let deviation = scene.places[i as usize].deviation_mm;
-                out.push((*edge, *side, (own.s, own.r, deviation, line_of(scene, i))));
-            }
-        }
+        let (piece, rest) = layer.split_at(at);
+        pieces.push(piece);
+        layer = rest;
     }
-    out
+    pieces.push(layer);
+    pieces
 }
+
+/// A point near an edge: (arc length, layer, point, side).
+pub(super) type Near = (f64, u32, u32, u8);
 
 /// The points within `radius_mm[edge]` of every edge, on either of its faces, in order of arc length: at most `limit` a stretch of
 /// `stretch_mm[edge]`, evenly chosen.
-pub(super) fn zones<B: Body>(
-    scene: &Scene<'_>,
-    body: &B,
+pub(super) fn near(
+    layers: &[&[Sight]],
+    edges: &[BodyEdge],
     radius_mm: &[f64],
     stretch_mm: &[f64],
     limit: usize,
-) -> Vec<Vec<ZonePoint>> {
-    let nearby = |e: usize| -> Vec<(f64, u32, usize)> {
-        let mut found = Vec::new();
-        let mut near = Vec::new();
-        if radius_mm[e] <= 0.0 {
-            return near;
-        }
-        let [first, second] = scene.edges[e].faces;
-        let sides = if first == second { 1 } else { 2 };
-        for side in 0..sides {
-            for &i in &scene.by_face[scene.edges[e].faces[side] as usize] {
-                let p = scene.cloud.positions[i as usize];
-                if let Some(seen) = scene.tracks[e].seen(p, side, radius_mm[e], &mut found)
-                    && seen.distance <= radius_mm[e]
-                    && scene.tracks[e].covers(seen.s)
-                {
-                    near.push((seen.s, i, side));
-                }
-            }
-        }
-        near.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        near
+) -> Vec<Vec<Near>> {
+    let near_of = |(index, layer): (usize, &&[Sight])| {
+        let is_near = |sight: &&Sight| {
+            let edge = sight.edge as usize;
+            // Of an edge between a face and itself both sides see every point.
+            let [first, second] = edges[edge].faces;
+            let once = first != second || sight.side == 0;
+            sight.distance <= radius_mm[edge] && sight.beside && once
+        };
+        let name = |sight: &Sight| {
+            let near = (sight.s, index as u32, sight.point, sight.side);
+            (sight.edge as usize, near)
+        };
+        layer.iter().filter(is_near).map(name).collect::<Vec<_>>()
     };
-    let place = |e: usize, (s, i, side): (f64, u32, usize)| -> Option<ZonePoint> {
-        let p = scene.cloud.positions[i as usize];
-        let own = scene.places[i as usize].deviation_mm;
-        let foot = body.foot(scene.edges[e].faces[1 - side], p, None)?;
-        let other = (p - foot.point).dot(foot.normal);
-        Some(ZonePoint {
-            s,
-            r: scene.tracks[e].depths(p),
-            deviation: if side == 0 {
-                [own, other]
-            } else {
-                [other, own]
-            },
-        })
-    };
-    (0..scene.edges.len())
+    let found: Vec<Vec<(usize, Near)>> = layers.par_iter().enumerate().map(near_of).collect();
+    let mut lists: Vec<Vec<Near>> = vec![Vec::new(); edges.len()];
+    for (edge, near) in found.into_iter().flatten() {
+        lists[edge].push(near);
+    }
+    lists
         .into_par_iter()
-        .map(|e| {
-            let near = nearby(e);
-            let stretch = |s: f64| (s / stretch_mm[e]) as usize;
-            let mut points = Vec::new();
-            for group in near.chunk_by(|a, b| stretch(a.0) == stretch(b.0)) {
-                let step = group.len().div_ceil(limit).max(1);
-                points.extend(
-                    group
-                        .iter()
-                        .step_by(step)
-                        .filter_map(|found| place(e, *found)),
-                );
-            }
-            points
+        .zip(stretch_mm)
+        .map(|(mut list, stretch_mm)| {
+            list.sort_by(|a, b| {
+                a.0.total_cmp(&b.0)
+                    .then((a.1, a.2, a.3).cmp(&(b.1, b.2, b.3)))
+            });
+            let stretch = |near: &Near| (near.0 / stretch_mm) as usize;
+            let groups = list.chunk_by(|a, b| stretch(a) == stretch(b));
+            groups
+                .flat_map(|group| {
+                    let step = group.len().div_ceil(limit).max(1);
+                    group.iter().step_by(step).copied()
+                })
+                .collect()
         })
         .collect()
 }
 
-/// The scan line of a point, one number for a profile of a view.
-fn line_of(scene: &Scene<'_>, i: u32) -> u32 {
-    match scene.cloud.origins.get(i as usize) {
-        Some(origin) => (u32::from(origin.view) << 24 ^ origin.profile).min(NO_LINE - 1),
-        None => NO_LINE,
-    }
+/// A point near edge `e` in the coordinates of its section; `None` where it has no foot on the other face.
+pub(super) fn zone_point<B: Body>(
+    body: &B,
+    tracks: &Tracks,
+    (e, edge): (usize, &BodyEdge),
+    layers: &[Layer<'_>],
+    (s, layer, point, side): Near,
+) -> Option<ZonePoint> {
+    let (layer, side) = (&layers[layer as usize], side as usize);
+    let p = layer.positions[point as usize];
+    let own = layer.places[point as usize].deviation_mm;
+    let foot = body.foot(edge.faces[1 - side], p, None)?;
+    let other = (p - foot.point).dot(foot.normal);
+    Some(ZonePoint {
+        s,
+        r: tracks.tracks[e].depths(p),
+        deviation: if side == 0 {
+            [own, other]
+        } else {
+            [other, own]
+        },
+    })
 }

@@ -4,16 +4,18 @@
 //! missing.
 
 use std::collections::BTreeMap;
+use std::f64::consts::PI;
 
 use glam::DVec3;
 
-use super::body::{Body, BodyEdge};
-use super::measure::{MeasuredEdge, PARALLEL};
-use crate::features::{Class, Detection};
-use crate::points::{Neighbors, PointCloud};
+use super::attention::{CellSet, Outline, Patches, attended};
+use super::body::BodyEdge;
+use super::measure::{MeasuredEdge, MeasuredStation, PARALLEL};
+use crate::features::{self, Class, Method};
+use crate::points::{Neighbors, PointCloud, Spacing};
 
 /// Spacings within which an edge found belongs to a nominal edge, beside what the edge break takes.
-const NEAR: f64 = 4.0;
+pub(super) const NEAR: f64 = 4.0;
 
 /// Length in spacings from which edge points without a nominal edge are an edge, not an accident.
 const LONG: f64 = 10.0;
@@ -30,60 +32,79 @@ pub struct Compared {
     pub missing: Vec<String>,
 }
 
-/// Compares the edges that `detection` found in `cloud`, which lies in the part frame, with those of the nominal.
-pub fn compare<B: Body>(
-    cloud: &PointCloud,
-    detection: &Detection,
-    nominal: &B,
-    edges: (&[BodyEdge], &[MeasuredEdge]),
-) -> Compared {
-    let spacing = detection.spacing.across_mm;
-    if spacing <= 0.0 {
+/// Points in the part frame with what their patches say of them.
+pub(super) struct Scanned<'a> {
+    /// One or more parts of the scan.
+    pub(super) clouds: &'a [&'a PointCloud],
+    pub(super) patches: &'a Patches,
+    pub(super) outline: &'a Outline,
+    pub(super) spacing: Spacing,
+    pub(super) noise_mm: f64,
+}
+
+/// Distance within which what is found belongs to a nominal edge, mm.
+pub(super) fn near_mm(spacing: &Spacing) -> f64 {
+    NEAR * spacing.across_mm
+}
+
+/// Compares the edges of a scan with those of the nominal. The detector looks only where the deviation from the nominal, or a station
+/// without an edge of its own, gives it reason to.
+pub(super) fn compare(scanned: &Scanned<'_>, edges: (&[BodyEdge], &[MeasuredEdge])) -> Compared {
+    let outline = scanned.outline;
+    if outline.near_mm() <= 0.0 {
         return Compared::default();
     }
-    let (edges, measured) = edges;
-    let found: Vec<DVec3> = cloud
-        .positions
-        .iter()
-        .zip(&detection.classes)
-        .filter(|(_, class)| matches!(class, Class::Edge | Class::Corner))
-        .map(|(p, _)| *p)
-        .collect();
-    let near = NEAR * spacing;
+    let doubtful = doubtful(edges.1);
+    let all: Vec<DVec3> = doubtful.iter().flatten().copied().collect();
+    let cells = scanned.patches.suspicious(outline, scanned.noise_mm);
+    let found = edges_found(scanned, &cells, &all);
     Compared {
-        unexpected: unexpected(&found, nominal, edges, near),
-        missing: missing(&found, edges, measured, near),
+        unexpected: unexpected(&found, outline),
+        missing: missing(&found, edges, &doubtful, outline.near_mm()),
     }
 }
 
-fn unexpected<B: Body>(
-    found: &[DVec3],
-    nominal: &B,
-    edges: &[BodyEdge],
-    near: f64,
-) -> Vec<Vec<DVec3>> {
-    let mut along = Vec::new();
-    for (e, edge) in edges.iter().enumerate() {
-        let count = (edge.length_mm / (0.5 * near)).ceil().clamp(1.0, 1e5) as usize;
-        for k in 0..=count {
-            let s = edge.length_mm * k as f64 / count as f64;
-            along.push(nominal.station(e, s).point);
-        }
-    }
-    let known = Neighbors::new(&along);
+/// The points of the scan around `cells` and `places` that lie on an edge.
+fn edges_found(scanned: &Scanned<'_>, cells: &CellSet, places: &[DVec3]) -> Vec<DVec3> {
+    let mut counts = Vec::new();
+    let parts = scanned.clouds.iter().map(|cloud| {
+        let attended = attended(&cloud.positions, scanned.outline, cells, places);
+        counts.extend(attended.counts);
+        cloud.subset(&attended.seen)
+    });
+    // All parts name the same views.
+    let together = parts.reduce(|mut all, part| {
+        all.positions.extend(part.positions);
+        all.origins.extend(part.origins);
+        all
+    });
+    let Some(some) = together else {
+        return Vec::new();
+    };
+    let neighbors = Neighbors::new(&some.positions);
+    let known = (scanned.spacing, scanned.noise_mm);
+    let detection = features::detect_knowing(&some, &neighbors, known, Method::Adaptive);
+    let is_edge = |class: &Class| matches!(class, Class::Edge | Class::Corner);
+    let found = some.positions.iter().zip(&detection.classes);
+    found
+        .zip(&counts)
+        .filter(|((_, class), counts)| **counts && is_edge(class))
+        .map(|((p, _), _)| *p)
+        .collect()
+}
+
+fn unexpected(found: &[DVec3], outline: &Outline) -> Vec<Vec<DVec3>> {
     let mut hit = Vec::new();
     let strange: Vec<DVec3> = found
         .iter()
         .copied()
-        .filter(|p| {
-            known.nearest(*p, 1, &mut hit);
-            hit.first().is_none_or(|h| h.1 > near * near)
-        })
+        .filter(|p| !outline.is_near(*p, &mut hit))
         .collect();
-    let mut lines: Vec<Vec<DVec3>> = clusters(&strange, 0.5 * near)
+    let near_mm = outline.near_mm();
+    let mut lines: Vec<Vec<DVec3>> = clusters(&strange, 0.5 * near_mm)
         .into_iter()
-        .filter_map(|cluster| polyline(&cluster, 0.5 * near))
-        .filter(|line| length(line) > LONG / NEAR * near)
+        .filter_map(|cluster| polyline(&cluster, 0.5 * near_mm))
+        .filter(|line| length(line) > LONG / NEAR * near_mm)
         .collect();
     lines.sort_by(|a, b| length(b).total_cmp(&length(a)));
     lines
@@ -138,28 +159,42 @@ fn length(line: &[DVec3]) -> f64 {
     line.windows(2).map(|pair| pair[0].distance(pair[1])).sum()
 }
 
+/// Places of the stations, by edge, whose flanks were both seen and do not turn as those of an edge do: by half the nominal's angle.
+fn doubtful(measured: &[MeasuredEdge]) -> Vec<Vec<DVec3>> {
+    let place = |station: &MeasuredStation| match &station.outcome {
+        Ok(measured) => {
+            let [first, second] = station.station.normals;
+            let turn = PI - measured.included_angle_rad;
+            let nominal = first.angle_between(second);
+            (turn.abs() < 0.5 * nominal).then_some(measured.point)
+        }
+        // Both flanks are seen, and they go on into each other.
+        Err(reason) => (reason == PARALLEL).then_some(station.station.point),
+    };
+    let of = |edge: &MeasuredEdge| edge.stations.iter().filter_map(place).collect();
+    measured.iter().map(of).collect()
+}
+
 /// Edges whose flanks were both seen over most of their length, and along which nothing was found.
 fn missing(
     found: &[DVec3],
-    edges: &[BodyEdge],
-    measured: &[MeasuredEdge],
-    near: f64,
+    (edges, measured): (&[BodyEdge], &[MeasuredEdge]),
+    doubtful: &[Vec<DVec3>],
+    near_mm: f64,
 ) -> Vec<String> {
     let tree = Neighbors::new(found);
     let mut hit = Vec::new();
     let mut ids = Vec::new();
-    for (edge, measured) in edges.iter().zip(measured) {
-        let (mut adequate, mut without) = (0.0, 0.0);
-        for station in &measured.stations {
-            let place = match &station.outcome {
-                Ok(measured) => measured.point,
-                // Both flanks are seen, and they go on into each other.
-                Err(reason) if reason == PARALLEL => station.station.point,
-                Err(_) => continue,
-            };
-            adequate += 1.0;
-            tree.nearest(place, 1, &mut hit);
-            without += f64::from(hit.first().is_none_or(|h| h.1 > near * near));
+    for ((edge, measured), doubtful) in edges.iter().zip(measured).zip(doubtful) {
+        let both = |s: &&MeasuredStation| match &s.outcome {
+            Ok(_) => true,
+            Err(reason) => reason == PARALLEL,
+        };
+        let adequate = measured.stations.iter().filter(both).count() as f64;
+        let mut without = 0.0;
+        for place in doubtful {
+            tree.nearest(*place, 1, &mut hit);
+            without += f64::from(hit.first().is_none_or(|h| h.1 > near_mm * near_mm));
         }
         let enough = adequate > 0.5 * measured.stations.len() as f64;
         if enough && without >= MISSING * adequate {

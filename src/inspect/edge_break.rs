@@ -74,6 +74,7 @@ pub(super) struct Stretch<'a> {
 }
 
 /// A break with what the ridge of its stations needs.
+#[derive(Debug, Clone)]
 pub(super) struct Found {
     pub(super) shape: EdgeBreak,
     /// The highest place of the profile in the section: along (n1 - n2) and along the bisector, mm, from the virtual edge.

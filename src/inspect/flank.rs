@@ -6,11 +6,14 @@
 //!
 //! Sources: features-and-standards, section 5, characteristics 5b (virtual edge), 8 (detachment point), 20 and 21.
 
+mod memo;
 mod transition;
 mod variance;
 
 use super::clusters::{Clusters, NO_GROUP};
 use crate::geometry::fit::{LinearFit, fit_robust};
+
+pub use memo::Memo;
 
 /// Points of one flank in the coordinates of its edge, in order of arc length.
 #[derive(Debug, Clone, Default)]
@@ -186,16 +189,26 @@ pub fn measure_flank(
     windows: &Windows,
     settings: &FlankSettings,
 ) -> FlankSeries {
-    let settled = settle_cuts::<4>(points, windows, settings);
-    let bent = fit_series::<4>(points, windows, &settled);
+    measure_flank_again(points, windows, settings, &mut Memo::default())
+}
+
+/// As [`measure_flank`], of a flank that has been measured before: windows whose points are still the same are not fitted again.
+pub fn measure_flank_again(
+    points: &FlankPoints,
+    windows: &Windows,
+    settings: &FlankSettings,
+    memo: &mut Memo,
+) -> FlankSeries {
+    let settled = settle_cuts::<4>(points, windows, settings, memo);
+    let bent = fit_series::<4>(points, windows, &settled, memo);
     if bend_is_significant(&bent) {
-        let richer = fit_series::<5>(points, windows, &settled);
+        let richer = fit_series::<5>(points, windows, &settled, memo);
         return finish(bent, &richer, &settled, FlankModel::Bent);
     }
     // A straight flank is extrapolated with less noise, so its transition zone is seen more sharply.
-    let settled = settle_cuts::<3>(points, windows, settings);
-    let straight = fit_series::<3>(points, windows, &settled);
-    let richer = fit_series::<4>(points, windows, &settled);
+    let settled = settle_cuts::<3>(points, windows, settings, memo);
+    let straight = fit_series::<3>(points, windows, &settled, memo);
+    let richer = fit_series::<4>(points, windows, &settled, memo);
     finish(straight, &richer, &settled, FlankModel::Displaced)
 }
 
@@ -211,10 +224,11 @@ fn settle_cuts<const P: usize>(
     points: &FlankPoints,
     windows: &Windows,
     settings: &FlankSettings,
+    memo: &mut Memo,
 ) -> Settled {
     let mut settings = *settings;
     loop {
-        let cuts = transition::find_cuts::<P>(points, windows, &settings);
+        let cuts = transition::find_cuts::<P>(points, windows, &settings, memo);
         let wide = cuts.iter().flatten().any(|c| c.too_wide);
         if !wide || settings.reach_mm >= settings.reach_limit_mm {
             let cut_of = |c: &Option<transition::Cut>| c.map_or(settings.cut_mm, |c| c.cut_mm);
@@ -251,6 +265,7 @@ fn fit_series<const P: usize>(
     points: &FlankPoints,
     windows: &Windows,
     settled: &Settled,
+    memo: &mut Memo,
 ) -> Series<P> {
     let settings = &settled.settings;
     (0..windows.count)
@@ -261,7 +276,7 @@ fn fit_series<const P: usize>(
                 cut_mm: settled.cuts[k],
                 reach_mm: settings.reach_mm,
             };
-            fit_window(points, &range, settings)
+            memo.fit(points, (windows, k), &range, settings)
         })
         .collect()
 }

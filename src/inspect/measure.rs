@@ -2,35 +2,22 @@
 
 use std::ops::Range;
 
-use glam::DVec3;
-use rayon::prelude::*;
 
 use super::assign::{Place, Surface};
 use super::body::{Body, BodyEdge};
-use super::collect::{self, Scene, Track};
 use super::contributions::{Response, Shared};
-use super::edge_break::{self, Found, POINTS_MAX, STRETCH, Stretch, Wedge, ZonePoint};
-use super::flank::{
-    FlankFit, FlankGap, FlankModel, FlankSeries, FlankSettings, Windows, measure_flank,
-};
+use super::edge_break::{Found, STRETCH, Stretch, Wedge, ZonePoint};
+use super::flank::{FlankFit, FlankGap, FlankModel, FlankSeries, Windows};
+use super::measuring::{Breaks, measured};
 use super::result::{
     Boundary, Budget, DepthPoint, EdgeBreak, EdgeMean, EdgePoint, Measured, Quantified,
 };
-use super::virtual_edge::{VirtualEdge, intersect, nominal_angle};
+use super::virtual_edge::{VirtualEdge, intersect};
 use crate::nominal::{EdgeKind, Station};
 use crate::points::PointCloud;
 
 pub use super::contributions::Expansion;
 pub(super) use super::contributions::pose_row;
-
-/// Points that a flank of a station aims at: its offset is then known to a seventh of the noise.
-const WANTED_POINTS: f64 = 200.0;
-
-/// Depth of a flank in stations: deep enough that the tilt does not spoil the offset, shallow enough to stay near the edge.
-const DEPTH: f64 = 3.0;
-
-/// Scan lines that a station must hold: three hold a slope, one more to see its noise.
-const LINES: f64 = 4.0;
 
 /// The reason of a station where both flanks were measured and do not meet.
 pub const PARALLEL: &str = "the two flanks are parallel";
@@ -106,276 +93,15 @@ pub fn measure_edges_stepped<B: Body>(
     settings: &MeasureSettings,
     steps_mm: &[Option<f64>],
 ) -> Vec<MeasuredEdge> {
-    with_flanks(
-        cloud,
-        places,
-        surface,
-        (settings, steps_mm),
-        false,
-        |flanks| {
-            let context = flanks.context;
-            let zones = flanks.zones();
-            (0..flanks.series.len())
-                .into_par_iter()
-                .map(|e| context(e).combine(&flanks.windows[e], &flanks.series[e], &zones[e]))
-                .collect()
-        },
-    )
-}
-
-/// All flanks of a scan, with what is needed to combine them.
-pub(super) struct Flanks<'a, B: Body> {
-    pub(super) scene: &'a Scene<'a>,
-    pub(super) windows: &'a [Windows],
-    pub(super) series: &'a [[FlankSeries; 2]],
-    pub(super) context: &'a (dyn Fn(usize) -> EdgeContext<'a, B> + Sync),
-    body: &'a B,
-    spacing_mm: f64,
-}
-
-/// Fits all flanks and hands them to `then`.
-pub(super) fn with_flanks<B: Body, T>(
-    cloud: &PointCloud,
-    places: &[Place],
-    surface: &Surface<'_, B>,
-    (settings, steps_mm): (&MeasureSettings, &[Option<f64>]),
-    keep_designs: bool,
-    then: impl FnOnce(&Flanks<'_, B>) -> T,
-) -> T {
-    let edges = surface.body.edges();
-    let windows: Vec<Windows> = edges
-        .iter()
-        .enumerate()
-        .map(|(e, edge)| windows_of(edge, steps_mm.get(e).copied().flatten(), settings))
-        .collect();
-    let flank_settings: Vec<FlankSettings> = (0..edges.len())
-        .map(|e| {
-            let middle = surface.body.station(e, 0.5 * edges[e].length_mm);
-            let angle = nominal_angle(&middle, edges[e].kind);
-            FlankSettings {
-                keep_designs,
-                ..flank_settings(&windows[e], angle, settings)
-            }
-        })
-        .collect();
-    let tracks: Vec<Track> = (0..edges.len())
-        .into_par_iter()
-        .map(|e| Track::new(surface.body, e, &edges[e], &windows[e]))
-        .collect();
-    let radius: Vec<f64> = flank_settings.iter().map(|s| s.reach_mm).collect();
-    let scene = Scene {
-        cloud,
-        places,
-        edges: &edges,
-        tracks: &tracks,
-        radius_mm: &radius,
-        by_face: &collect::by_face(places, surface.body.face_count()),
-    };
-    let series = all_flanks(&scene, &windows, &flank_settings);
-    let shared = Shared {
-        pose_covariance: settings.pose_covariance,
-        u_calibration_mm: settings.u_calibration_mm,
-        expansion: settings.expansion,
-        centre: centre(&scene),
-    };
-    let context = |e: usize| EdgeContext {
-        body: surface.body,
-        index: e,
-        edge: &edges[e],
-        settings,
-        shared,
-    };
-    then(&Flanks {
-        scene: &scene,
-        windows: &windows,
-        series: &series,
-        context: &context,
-        body: surface.body,
-        spacing_mm: settings.along_mm,
-    })
-}
-
-/// The mean of the points that lie on the part: what a least-squares pose holds.
-fn centre(scene: &Scene<'_>) -> DVec3 {
-    let (mut sum, mut count) = (DVec3::ZERO, 0.0);
-    for list in scene.by_face {
-        for i in list {
-            sum += scene.cloud.positions[*i as usize];
-            count += 1.0;
-        }
-    }
-    sum / f64::max(count, 1.0)
-}
-
-impl<B: Body> Flanks<'_, B> {
-    /// The points of every edge's transition zone.
-    pub(super) fn zones(&self) -> Vec<Vec<ZonePoint>> {
-        let radius = |pair: &[FlankSeries; 2]| {
-            let fits = || pair.iter().flat_map(|s| s.stations.iter().flatten());
-            let cut = fits().map(|f| f.cut_mm).fold(0.0, f64::max);
-            let off = fits().map(|f| f.offset_mm.abs()).fold(0.0, f64::max);
-            let seen = pair.iter().all(|s| s.stations.iter().any(Result::is_ok));
-            let reach = Stretch::reach_of(cut, self.spacing_mm);
-            if seen {
-                reach + 2.0 * off.min(reach)
-            } else {
-                0.0
-            }
-        };
-        let radius: Vec<f64> = self.series.iter().map(radius).collect();
-        let stretch: Vec<f64> = self
-            .windows
-            .iter()
-            .map(|w| STRETCH as f64 * w.step_mm)
-            .collect();
-        collect::zones(self.scene, self.body, &radius, &stretch, POINTS_MAX)
-    }
-}
-
-/// Stations about as long as needed for [`WANTED_POINTS`] and [`LINES`], a whole number of them on the edge.
-fn windows_of(edge: &BodyEdge, step_mm: Option<f64>, settings: &MeasureSettings) -> Windows {
-    let area = settings.along_mm * settings.across_mm;
-    let derived = (WANTED_POINTS * area / DEPTH)
-        .sqrt()
-        .max(LINES * settings.across_mm);
-    let step = step_mm
-        .or(settings.station_step_mm)
-        .unwrap_or(derived)
-        .max(1e-9);
-    // No more than a hundred thousand stations, whatever the step.
-    let count = (edge.length_mm / step).round().clamp(1.0, 1e5);
-    Windows {
-        count: count as usize,
-        step_mm: edge.length_mm / count,
-    }
-}
-
-fn flank_settings(
-    windows: &Windows,
-    included_angle_rad: f64,
-    settings: &MeasureSettings,
-) -> FlankSettings {
-    let area = settings.along_mm * settings.across_mm;
-    // A short edge or a given step makes the window narrow; the reach then makes up for the points.
-    let derived = (DEPTH * windows.step_mm)
-        .max(WANTED_POINTS * area / windows.step_mm)
-        .min(
-            DEPTH
-                * (WANTED_POINTS * area / DEPTH)
-                    .sqrt()
-                    .max(LINES * settings.across_mm),
-        );
-    let reach_mm = settings.flank_mm.unwrap_or(derived).max(1e-9);
-    // Noise takes points nearer than this over the bisector to the other flank; the search for the transition zone does the rest.
-    let half = 0.5 * included_angle_rad.min(std::f64::consts::TAU - included_angle_rad);
-    let mixed = 4.0 * settings.noise_mm / half.tan().clamp(0.1, 1.0);
-    FlankSettings {
-        reach_mm,
-        reach_limit_mm: settings.flank_mm.unwrap_or(4.0 * reach_mm),
-        cut_mm: mixed
-            .max(settings.along_mm)
-            .clamp(1e-3 * reach_mm, 0.2 * reach_mm),
-        spacing_mm: settings.along_mm.max(1e-9),
-        min_points: 12,
-        keep_designs: false,
-    }
-}
-
-/// Both flanks of all edges. Where the transition zone of an edge turns out wider than assumed, the edges that share a
-/// face with it are measured again without the points in it.
-fn all_flanks(
-    scene: &Scene<'_>,
-    windows: &[Windows],
-    settings: &[FlankSettings],
-) -> Vec<[FlankSeries; 2]> {
-    let measure = |wanted: &[usize],
-                   cuts: &[[f64; 2]],
-                   scene: &Scene<'_>,
-                   settings: &[FlankSettings]| {
-        let points = collect::flanks(scene, wanted, cuts);
-        wanted
-            .par_iter()
-            .zip(points.par_iter())
-            .map(|(e, pair)| [0, 1].map(|i| measure_flank(&pair[i], &windows[*e], &settings[*e])))
-            .collect::<Vec<[FlankSeries; 2]>>()
-    };
-    // First without room to grow: few edges need it.
-    let narrow: Vec<FlankSettings> = settings
-        .iter()
-        .map(|s| FlankSettings {
-            reach_limit_mm: s.reach_mm,
-            ..*s
-        })
-        .collect();
-    // Of the other edges of a face more is left out than of the own: a displaced face moves its neighbour's edge.
-    let assumed: Vec<[f64; 2]> = settings
-        .iter()
-        .map(|s| [2.0 * s.cut_mm.max(2.0 * s.spacing_mm); 2])
-        .collect();
-    let all: Vec<usize> = (0..settings.len()).collect();
-    let mut series = measure(&all, &assumed, scene, &narrow);
-    let wide: Vec<bool> = series
-        .iter()
-        .map(|pair| pair.iter().any(|s| s.too_wide))
-        .collect();
-    let grown = |e: usize| {
-        if wide[e] {
-            settings[e].reach_limit_mm
-        } else {
-            settings[e].reach_mm
-        }
-    };
-    let room: Vec<f64> = (0..settings.len()).map(grown).collect();
-    let ample: Vec<FlankSettings> = (0..settings.len())
-        .map(|e| FlankSettings {
-            reach_limit_mm: room[e],
-            ..settings[e]
-        })
-        .collect();
-    let scene = &Scene {
-        radius_mm: &room,
-        ..*scene
-    };
-    let grow: Vec<usize> = (0..settings.len())
-        .filter(|e| wide[*e] && room[*e] > settings[*e].reach_mm)
-        .collect();
-    for (e, pair) in grow.iter().zip(measure(&grow, &assumed, scene, &ample)) {
-        series[*e] = pair;
-    }
-    let widest = |s: &FlankSeries| {
-        s.stations
-            .iter()
-            .flatten()
-            .map(|f| f.cut_mm)
-            .fold(0.0, f64::max)
-    };
-    let seen: Vec<[f64; 2]> = series
-        .iter()
-        .zip(&assumed)
-        .map(|(pair, least)| [0, 1].map(|i| widest(&pair[i]).max(least[i])))
-        .collect();
-    let mut disturbed = vec![false; scene.by_face.len()];
-    for (e, edge) in scene.edges.iter().enumerate() {
-        for side in 0..2 {
-            disturbed[edge.faces[side] as usize] |= seen[e][side] > assumed[e][side];
-        }
-    }
-    let again: Vec<usize> = all
-        .into_iter()
-        .filter(|e| scene.edges[*e].faces.iter().any(|f| disturbed[*f as usize]))
-        .collect();
-    for (e, pair) in again.iter().zip(measure(&again, &seen, scene, &ample)) {
-        series[*e] = pair;
-    }
-    series
+    measured(cloud, places, surface, (settings, steps_mm))
 }
 
 /// What is needed to combine the flanks of one edge.
 pub(super) struct EdgeContext<'a, B: Body> {
-    body: &'a B,
-    index: usize,
-    edge: &'a BodyEdge,
-    settings: &'a MeasureSettings,
+    pub(super) body: &'a B,
+    pub(super) index: usize,
+    pub(super) edge: &'a BodyEdge,
+    pub(super) settings: MeasureSettings,
     pub(super) shared: Shared,
 }
 
@@ -384,10 +110,9 @@ impl<B: Body> EdgeContext<'_, B> {
         &self,
         windows: &Windows,
         series: &[FlankSeries; 2],
-        zone: &[ZonePoint],
+        breaks: &Breaks,
     ) -> MeasuredEdge {
         let mut stations = Vec::with_capacity(windows.count);
-        let mut edges: Vec<Option<VirtualEdge>> = Vec::with_capacity(windows.count);
         let mut sum = MeanSum::default();
         for k in 0..windows.count {
             let station = self.station(windows, k);
@@ -397,10 +122,9 @@ impl<B: Body> EdgeContext<'_, B> {
                 Err(FlankGap::TooFew(seen, _)) => *seen,
                 Err(_) => 0,
             });
-            let mut edge = None;
             let outcome = match flanks {
                 [Ok(first), Ok(second)] => {
-                    edge = self.virtual_edge(&station, [first, second]);
+                    let edge = self.virtual_edge(&station, [first, second]);
                     edge.map(|edge| {
                         let models = [series[0].model, series[1].model];
                         let reach = [series[0].reach_mm, series[1].reach_mm];
@@ -413,7 +137,6 @@ impl<B: Body> EdgeContext<'_, B> {
                 }
                 _ => Err(self.reason(flanks)),
             };
-            edges.push(edge);
             let boundary = match flanks {
                 [Ok(seen), Err(_)] => Some(self.boundary(&station, seen, 0)),
                 [Err(_), Ok(seen)] => Some(self.boundary(&station, seen, 1)),
@@ -426,8 +149,13 @@ impl<B: Body> EdgeContext<'_, B> {
                 points,
             });
         }
+        for (range, found) in breaks {
+            for station in &mut stations[range.clone()] {
+                add_ridge(station, found);
+            }
+        }
         MeasuredEdge {
-            breaks: self.breaks(windows, series, zone, &edges, &mut stations),
+            breaks: breaks.iter().map(|(_, found)| found.shape.clone()).collect(),
             flank_model: [series[0].model, series[1].model],
             stations,
             mean: self.mean(&sum, series),
@@ -583,27 +311,6 @@ impl<B: Body> EdgeContext<'_, B> {
                 u: variance.sqrt(),
             },
         })
-    }
-
-    /// The breaks of all stretches; gives the stations of each their ridge.
-    fn breaks(
-        &self,
-        windows: &Windows,
-        series: &[FlankSeries; 2],
-        zone: &[ZonePoint],
-        edges: &[Option<VirtualEdge>],
-        stations: &mut [MeasuredStation],
-    ) -> Vec<EdgeBreak> {
-        let mut breaks = Vec::new();
-        for (range, stretch) in self.stretches(windows, series, zone, edges) {
-            if let Some(found) = edge_break::measure_stretch(&stretch) {
-                for station in &mut stations[range] {
-                    add_ridge(station, &found);
-                }
-                breaks.push(found.shape);
-            }
-        }
-        breaks
     }
 
     /// The stretches of an edge in which some station was measured, each with its stations.

@@ -17,7 +17,9 @@ use super::assign::{Place, Surface};
 use super::body::Body;
 use super::edge_break::draw_stretch;
 use super::flank::{Design, FlankFit};
-use super::measure::{EdgeContext, Flanks, MeasureSettings, MeasuredEdge, across, with_flanks};
+use super::collect::Layer;
+use super::measure::{EdgeContext, MeasureSettings, MeasuredEdge, across};
+use super::measuring::{Measuring, centre};
 use super::result::Measured;
 use crate::nominal::Station;
 use crate::points::PointCloud;
@@ -118,17 +120,37 @@ pub fn measure_monte_carlo<B: Body>(
     how: &MonteCarlo,
 ) -> Vec<Vec<Option<DrawnStation>>> {
     let pose = root(&settings.pose_covariance);
-    with_flanks(cloud, places, surface, (settings, &[]), true, |flanks| {
-        let draw = |e: usize, k: usize| station(flanks, settings, &pose, how, (e, k));
-        (0..flanks.series.len())
-            .map(|e| {
-                (0..flanks.windows[e].count)
-                    .into_par_iter()
-                    .map(|k| draw(e, k))
-                    .collect()
-            })
-            .collect()
-    })
+    let layers = [Layer::new(cloud, places)];
+    let flanks = with_designs(&layers, surface, (settings, &[]));
+    let draw = |e: usize, k: usize| station(&flanks, settings, &pose, how, (e, k));
+    (0..flanks.measuring.series().len())
+        .map(|e| {
+            (0..flanks.measuring.windows()[e].count)
+                .into_par_iter()
+                .map(|k| draw(e, k))
+                .collect()
+        })
+        .collect()
+}
+
+/// The flanks of all edges with the designs of their fits.
+struct Flanks<'a, B: Body> {
+    measuring: Measuring<'a, B>,
+    centre: DVec3,
+}
+
+fn with_designs<'a, B: Body>(
+    layers: &[Layer<'_>; 1],
+    surface: &Surface<'a, B>,
+    (settings, steps_mm): (&MeasureSettings, &[Option<f64>]),
+) -> Flanks<'a, B> {
+    let mut measuring = Measuring::new(surface, settings, steps_mm, true);
+    measuring.add(&layers[0]);
+    measuring.measure(layers);
+    Flanks {
+        measuring,
+        centre: centre(layers),
+    }
 }
 
 /// As [`super::measure::measure_edges_stepped`], with the uncertainties of d1, d2, the total, the included angle and the edge breaks from
@@ -142,53 +164,54 @@ pub fn measure_edges_drawn<B: Body>(
     told: &(dyn Fn(usize, usize) + Sync),
 ) -> (Vec<MeasuredEdge>, Trials) {
     let pose = root(&settings.pose_covariance);
-    let given = (settings, steps_mm);
-    with_flanks(cloud, places, surface, given, true, |flanks| {
-        let zones = flanks.zones();
-        let mut trials = Trials {
-            seed: how.seed,
-            stations: [usize::MAX, 0],
-            unstable: 0,
-            breaks: 0,
-        };
-        let count = flanks.series.len();
-        let mut edges = Vec::with_capacity(count);
-        for (e, zone) in zones.iter().enumerate() {
-            told(e, count);
-            let context = (flanks.context)(e);
-            let (windows, series) = (&flanks.windows[e], &flanks.series[e]);
-            let mut edge = context.combine(windows, series, zone);
-            let drawn: Vec<Option<DrawnStation>> = (0..windows.count)
-                .into_par_iter()
-                .map(|k| station(flanks, settings, &pose, how, (e, k)))
-                .collect();
-            for (station, drawn) in edge.stations.iter_mut().zip(drawn) {
-                if let (Ok(measured), Some(drawn)) = (&mut station.outcome, drawn) {
-                    take_over(measured, &drawn);
-                    trials.stations[0] = trials.stations[0].min(drawn.trials);
-                    trials.stations[1] = trials.stations[1].max(drawn.trials);
-                    trials.unstable += usize::from(!drawn.stable);
-                }
+    let layers = [Layer::new(cloud, places)];
+    let mut flanks = with_designs(&layers, surface, (settings, steps_mm));
+    let zones = flanks.measuring.zones(&layers);
+    let breaks = flanks.measuring.breaks(&layers);
+    let (flanks, measuring) = (&flanks, &flanks.measuring);
+    let mut trials = Trials {
+        seed: how.seed,
+        stations: [usize::MAX, 0],
+        unstable: 0,
+        breaks: 0,
+    };
+    let count = measuring.series().len();
+    let mut edges = Vec::with_capacity(count);
+    for (e, zone) in zones.iter().enumerate() {
+        told(e, count);
+        let context = measuring.context(e, settings, flanks.centre);
+        let (windows, series) = (&measuring.windows()[e], &measuring.series()[e]);
+        let mut edge = context.combine(windows, series, &breaks[e]);
+        let drawn: Vec<Option<DrawnStation>> = (0..windows.count)
+            .into_par_iter()
+            .map(|k| station(flanks, settings, &pose, how, (e, k)))
+            .collect();
+        for (station, drawn) in edge.stations.iter_mut().zip(drawn) {
+            if let (Ok(measured), Some(drawn)) = (&mut station.outcome, drawn) {
+                take_over(measured, &drawn);
+                trials.stations[0] = trials.stations[0].min(drawn.trials);
+                trials.stations[1] = trials.stations[1].max(drawn.trials);
+                trials.unstable += usize::from(!drawn.stable);
             }
-            let virtual_edges = context.virtual_edges(windows, series);
-            let stretches = context.stretches(windows, series, zone, &virtual_edges);
-            let breaks: Vec<_> = stretches
-                .par_iter()
-                .map(|(range, stretch)| {
-                    let place = ((e as u64) << 32) ^ range.start as u64 ^ (1 << 63);
-                    draw_stretch(stretch, own_seed(how.seed, place), how.break_trials())
-                })
-                .collect();
-            for (shape, drawn) in edge.breaks.iter_mut().zip(breaks.into_iter().flatten()) {
-                *shape = drawn.shape;
-                trials.breaks = trials.breaks.max(drawn.trials);
-            }
-            edges.push(edge);
         }
-        told(count, count);
-        trials.stations[0] = trials.stations[0].min(trials.stations[1]);
-        (edges, trials)
-    })
+        let virtual_edges = context.virtual_edges(windows, series);
+        let stretches = context.stretches(windows, series, zone, &virtual_edges);
+        let breaks: Vec<_> = stretches
+            .par_iter()
+            .map(|(range, stretch)| {
+                let place = ((e as u64) << 32) ^ range.start as u64 ^ (1 << 63);
+                draw_stretch(stretch, own_seed(how.seed, place), how.break_trials())
+            })
+            .collect();
+        for (shape, drawn) in edge.breaks.iter_mut().zip(breaks.into_iter().flatten()) {
+            *shape = drawn.shape;
+            trials.breaks = trials.breaks.max(drawn.trials);
+        }
+        edges.push(edge);
+    }
+    told(count, count);
+    trials.stations[0] = trials.stations[0].min(trials.stations[1]);
+    (edges, trials)
 }
 
 /// The standard uncertainties of a station by its trials. That of the total is about its value: near zero, where a distance cannot fall
@@ -221,13 +244,13 @@ fn station<B: Body>(
     how: &MonteCarlo,
     (e, k): (usize, usize),
 ) -> Option<DrawnStation> {
-    let pair = &flanks.series[e];
+    let pair = &flanks.measuring.series()[e];
     let (Ok(first), Ok(second)) = (&pair[0].stations[k], &pair[1].stations[k]) else {
         return None;
     };
-    let context = (flanks.context)(e);
+    let context = flanks.measuring.context(e, settings, flanks.centre);
     let model = Model {
-        station: context.station(&flanks.windows[e], k),
+        station: context.station(&flanks.measuring.windows()[e], k),
         context,
         fits: [first, second],
         designs: [pair[0].designs.get(k)?, pair[1].designs.get(k)?],

@@ -4,7 +4,6 @@ use glam::DVec3;
 
 use super::flank::FlankModel;
 use super::monte_carlo::Trials;
-use crate::features::Class;
 use crate::geometry::RigidTransform;
 use crate::nominal::{EdgeKind, Station};
 use crate::points::Spacing;
@@ -47,19 +46,17 @@ pub struct Inspection {
     pub seconds: Vec<(&'static str, f64)>,
     /// What was wrong with the data; the result goes on.
     pub findings: Vec<String>,
-    /// What the scan is like and which of its points lie on edges; `None` where nothing was estimated.
+    /// What the scan is like; `None` where nothing was estimated.
     pub scan: Option<ScanEstimate>,
 }
 
 /// What was estimated from the scan itself.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ScanEstimate {
     /// Along and across the lines, and their mean.
     pub spacing: Spacing,
     /// Standard deviation of the points normal to the surface, mm.
     pub noise_mm: f64,
-    /// N classes, in the order of the cloud.
-    pub classes: Vec<Class>,
 }
 
 /// How the scan lies in the part frame, and how well that is known.

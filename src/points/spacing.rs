@@ -45,7 +45,7 @@ impl Spacing {
 /// From the lattice where there is one; else medians over a sample of places, where across the lines counts the radius within which a
 /// place has neighbours in every direction of its tangent plane; that holds for merged views and unorganised points alike.
 pub fn spacing(cloud: &PointCloud, neighbors: &Neighbors) -> Spacing {
-    let samples: Vec<[f64; 3]> = sample(neighbors.places())
+    let samples: Vec<[f64; 3]> = sample(neighbors.places(), SAMPLES)
         .par_iter()
         .filter_map(|&i| local_spacing(cloud, neighbors, cloud.positions[i as usize]))
         .collect();
@@ -76,6 +76,52 @@ pub fn spacing(cloud: &PointCloud, neighbors: &Neighbors) -> Spacing {
             across_mm: mean,
             mean_mm: mean,
         }
+    }
+}
+
+/// Spacing and noise of a scan that comes in pieces of some ten thousand points.
+#[derive(Debug, Default)]
+pub(crate) struct Estimator {
+    /// Of every piece: along, across, mean, mm.
+    spacings: [Vec<f64>; 3],
+    variances: Vec<(f64, f64)>,
+}
+
+/// Places of a piece at which its noise is looked at.
+const PIECE_SAMPLES: usize = 150;
+
+impl Estimator {
+    /// Takes a piece; one without a lattice, or too small for one, says nothing of the spacing.
+    pub(crate) fn add(&mut self, piece: &PointCloud, neighbors: &Neighbors) {
+        let Some((along, across)) = lattice_spacing(piece) else {
+            return;
+        };
+        let spacing = Spacing {
+            along_mm: along.min(across),
+            across_mm: along.max(across),
+            mean_mm: (along * across).sqrt(),
+        };
+        let values = [spacing.along_mm, spacing.across_mm, spacing.mean_mm];
+        for (list, value) in self.spacings.iter_mut().zip(values) {
+            list.push(value);
+        }
+        let variances = variances(piece, neighbors, &spacing, PIECE_SAMPLES);
+        self.variances.extend(variances);
+    }
+
+    /// What the pieces so far say together: spacing, and noise in mm; `None` where they say nothing.
+    pub(crate) fn estimate(&self) -> Option<(Spacing, f64)> {
+        if self.variances.is_empty() {
+            return None;
+        }
+        let [along_mm, across_mm, mean_mm] =
+            [0, 1, 2].map(|k| quantile(self.spacings[k].clone(), 0.5));
+        let spacing = Spacing {
+            along_mm,
+            across_mm,
+            mean_mm,
+        };
+        Some((spacing, noise_of(&self.variances)))
     }
 }
 
@@ -147,14 +193,28 @@ pub(crate) fn widest_gap(angles: &mut [f64]) -> f64 {
 /// From residuals of local quadric fits, corrected for degrees of freedom; a low quantile over many places, so that edges, outliers and
 /// small radii do not raise it.
 pub fn noise_mm(cloud: &PointCloud, neighbors: &Neighbors, spacing: &Spacing) -> f64 {
-    const QUANTILE: f64 = 0.15;
-    const NORMAL_QUANTILE: f64 = -1.036;
+    noise_of(&variances(cloud, neighbors, spacing, SAMPLES))
+}
+
+/// Residual variances, mm², and degrees of freedom at about so many places.
+fn variances(
+    cloud: &PointCloud,
+    neighbors: &Neighbors,
+    spacing: &Spacing,
+    samples: usize,
+) -> Vec<(f64, f64)> {
     let ratio = (spacing.across_mm / spacing.along_mm.max(f64::MIN_POSITIVE)).clamp(1.0, 20.0);
     let k = (32.0 * (ratio / 1.5).max(1.0)) as usize;
-    let variances: Vec<(f64, f64)> = sample(neighbors.places())
+    sample(neighbors.places(), samples)
         .par_iter()
         .filter_map(|&i| quadric_variance(cloud, neighbors, (cloud.positions[i as usize], k)))
-        .collect();
+        .collect()
+}
+
+/// The noise that the quiet ones of many places show, mm.
+fn noise_of(variances: &[(f64, f64)]) -> f64 {
+    const QUANTILE: f64 = 0.15;
+    const NORMAL_QUANTILE: f64 = -1.036;
     if variances.is_empty() {
         return 0.0;
     }
@@ -224,8 +284,8 @@ fn residual_after(mut columns: [Vec<f64>; 7]) -> (f64, usize) {
     (dot(last, last), rank)
 }
 
-fn sample(places: &[u32]) -> Vec<u32> {
-    let step = (places.len() / SAMPLES).max(1);
+fn sample(places: &[u32], samples: usize) -> Vec<u32> {
+    let step = (places.len() / samples).max(1);
     places.iter().copied().step_by(step).collect()
 }
 

@@ -5,8 +5,9 @@ use std::f64::consts::PI;
 use acies::inspect::body::Body;
 use acies::inspect::quantity::Quantity;
 use acies::inspect::result::{Inspection, Verdict};
-use acies::inspect::{Recipe, Request, Start, inspect};
-use acies::points::PointCloud;
+use acies::geometry::RigidTransform;
+use acies::inspect::{Growing, Recipe, Request, Start, inspect};
+use acies::points::{Frame, PointCloud};
 use glam::{DMat3, DVec2, DVec3};
 
 use super::SIGMA;
@@ -401,4 +402,83 @@ fn the_boundary_of_a_drop_is_measured_along_the_flank_that_was_seen() {
     // What the unseen flank must be asked for decides nothing.
     let both = format!("{own} = [-0.1, 0.1]\n{other} = [-0.1, 0.1]");
     assert_eq!(verdict(&both), Verdict::NotDecidable);
+}
+
+/// Pieces of a scan as they would come: so many profiles of every view, then the next of every view.
+fn pieces(cloud: &PointCloud, profiles: u32) -> Vec<PointCloud> {
+    let last = cloud.origins.iter().map(|o| o.profile).max().unwrap_or(0);
+    let mut pieces = Vec::new();
+    for first in (0..=last).step_by(profiles as usize) {
+        for view in 0..cloud.views.len() {
+            let own: Vec<usize> = (0..cloud.len())
+                .filter(|i| {
+                    let origin = cloud.origins[*i];
+                    usize::from(origin.view) == view
+                        && (first..first + profiles).contains(&origin.profile)
+                })
+                .collect();
+            pieces.push(cloud.subset(&own));
+        }
+    }
+    pieces
+}
+
+#[test]
+fn a_part_measured_while_it_is_scanned_is_as_one_measured_afterwards() {
+    let mut noise = Noise(47);
+    let mut solid = Solid::prism(
+        &outline(&[
+            (0.0, 0.0),
+            (40.0, 0.0),
+            (40.0, 12.0),
+            (15.0, 12.0),
+            (15.0, 20.0),
+            (0.0, 20.0),
+        ]),
+        30.0,
+    );
+    for made in &mut solid.made {
+        made.offset = 0.02 * (noise.uniform() - 0.5);
+        made.gradient = DVec3::new(0.001 * noise.uniform(), 0.0, 0.001 * noise.uniform());
+    }
+    let cloud = solid.scan(&all_but_the_bottom(&solid), SIGMA, &mut noise);
+    let moved = noise.motion(0.03, 0.3);
+    let machine = cloud.map(Frame::Machine, |p| moved.point(p), |v| moved.vector(v));
+    let recipe = recipe("station_step_mm = 1.5\n[limits]\nd_mm = [-0.08, 0.08]");
+    let request = || Request::new(&recipe, Start::Rough(RigidTransform::IDENTITY));
+    let afterwards = inspect(&machine, &solid, &request());
+    let mut growing = Growing::new(&solid, request());
+    let mut so_far = Vec::new();
+    for (k, piece) in pieces(&machine, 6).into_iter().enumerate() {
+        growing.push(piece);
+        if k % 16 == 15 {
+            so_far = growing.measure();
+        }
+    }
+    assert_eq!(growing.len(), machine.len());
+    assert!(so_far.iter().any(|edge| edge.coverage > 0.5), "{so_far:?}");
+    let meanwhile = growing.finish();
+    assert_eq!(meanwhile.verdict, afterwards.verdict);
+    assert_eq!(meanwhile.alignment.status, afterwards.alignment.status);
+    assert_eq!(meanwhile.missing_edges, afterwards.missing_edges);
+    let mut compared = 0;
+    let mut worst: f64 = 0.0;
+    for (a, b) in meanwhile.edges.iter().zip(&afterwards.edges) {
+        assert_eq!(a.stations.len(), b.stations.len());
+        for (a, b) in a.stations.iter().zip(&b.stations) {
+            let (Some(a), Some(b)) = (&a.measured, &b.measured) else {
+                assert_eq!(a.measured.is_some(), b.measured.is_some(), "{a:?} {b:?}");
+                continue;
+            };
+            compared += 1;
+            for i in 0..2 {
+                worst = worst.max((a.d_mm[i] - b.d_mm[i]).abs() / b.u_d_mm[i]);
+                assert!((a.u_d_mm[i] / b.u_d_mm[i] - 1.0).abs() < 0.1, "{a:?} {b:?}");
+            }
+        }
+    }
+    println!("{compared} stations, worst difference {worst:.4} of u");
+    assert!(compared > 150, "{compared}");
+    // The poses come from other choices of points: a tenth of what they are known to.
+    assert!(worst < 0.3, "{worst}");
 }

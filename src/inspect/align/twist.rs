@@ -44,7 +44,7 @@ impl Twist {
     }
 
     /// The screw motion whose exponential is `motion`.
-    pub(super) fn logarithm(motion: &RigidTransform) -> Self {
+    pub(in crate::inspect) fn logarithm(motion: &RigidTransform) -> Self {
         let q = motion.rotation;
         let q = if q.w < 0.0 { -q } else { q };
         let turn = q.to_scaled_axis();
@@ -62,7 +62,7 @@ impl Twist {
     }
 
     /// What it moves at most at the rim of a part of half-diagonal `size_mm`, roughly, mm.
-    pub(super) fn size(&self, size_mm: f64) -> f64 {
+    pub(in crate::inspect) fn size(&self, size_mm: f64) -> f64 {
         self.turn.length() * size_mm + self.shift.length()
     }
 

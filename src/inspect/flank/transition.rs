@@ -1,7 +1,7 @@
 //! Where the transition zone of an edge ends: edge break, spot smear and mixed points all leave the flank there.
 
 use super::variance::{self, Noise};
-use super::{FlankPoints, FlankSettings, Range, WindowFit, Windows, fit_window, row};
+use super::{FlankPoints, FlankSettings, Memo, Range, WindowFit, Windows, row};
 
 /// Standard deviations of a bin's mean at which it has left the flank: 4 bins, 4 levels and two sides give a false
 /// alarm at one block in 130, and a false alarm costs a few points only.
@@ -33,12 +33,13 @@ pub(super) fn find_cuts<const P: usize>(
     points: &FlankPoints,
     windows: &Windows,
     settings: &FlankSettings,
+    memo: &mut Memo,
 ) -> Vec<Option<Cut>> {
     let blocks = windows.count.div_ceil(BLOCK);
     let walks: Vec<Walk> = (0..blocks)
         .map(|b| {
             let stations = b * BLOCK..((b + 1) * BLOCK).min(windows.count);
-            walk::<P>(points, windows, settings, stations)
+            walk::<P>(points, windows, settings, (stations, memo))
         })
         .collect();
     let common = common_cut(&walks).min(0.6 * settings.reach_mm);
@@ -110,7 +111,7 @@ fn walk<const P: usize>(
     points: &FlankPoints,
     windows: &Windows,
     settings: &FlankSettings,
-    stations: std::ops::Range<usize>,
+    (stations, memo): (std::ops::Range<usize>, &mut Memo),
 ) -> Walk {
     let mut cut = 0.5 * settings.reach_mm;
     let mut any = false;
@@ -127,7 +128,10 @@ fn walk<const P: usize>(
         };
         let fits: Vec<(usize, WindowFit<P>)> = stations
             .clone()
-            .filter_map(|k| Some((k, fit_window(points, &range(k), settings).ok()?)))
+            .filter_map(|k| {
+                let fit = memo.fit(points, (windows, k), &range(k), settings);
+                Some((k, fit.ok()?))
+            })
             .collect();
         any |= !fits.is_empty();
         let noise = variance::pooled(fits.iter().map(|f| &f.1));

@@ -1,0 +1,153 @@
+//! `cargo bench --bench latency [-- ROUNDS]`: the demo's part scanned in real time, 2,000,000 points in about 10 s; time from the last
+//! profile to the committed verdict, and what the daemon takes of the processor meanwhile. `-- stages` gives one run's seconds by stage.
+//!
+//! Simulated devices run in the same process on the same cores; their share is in the processor time shown.
+
+#![allow(clippy::print_stdout)] // what a bench is for
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use acies::cell::{self, Daemon, DaemonOptions, Mode, Snapshot, State};
+use acies::config::Cell;
+use acies::store::{Order, Store};
+use acies_drivers::link::cable::Cable;
+use acies_simulators::demo_cell::{DemoCell, DemoOptions, RunningCell};
+
+/// Points of a profile.
+const COLUMNS: u32 = 3200;
+/// Encoder counts between profiles, of 0.002 mm: 0.124 mm, four times what lies between two points of a profile.
+const STEP: &str = "62";
+/// Profiles a second: the 760 of a scan take 10 s.
+const RATE: &str = "76.0";
+/// Longer than anything here may take.
+const LONG: Duration = Duration::from_secs(120);
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let rounds = arguments.iter().find_map(|a| a.parse().ok()).unwrap_or(50);
+    let folder = std::env::temp_dir().join(format!("acies-latency-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    let stages = arguments.iter().any(|a| a == "stages");
+    let (playing, cell) = set_up(&folder, !stages);
+    if stages {
+        by_stage(&cell);
+    } else {
+        in_the_daemon(cell, &folder, rounds);
+    }
+    drop(playing);
+    let _ = std::fs::remove_dir_all(&folder);
+}
+
+/// The demo's cell with finer profiles.
+fn set_up(folder: &Path, paced: bool) -> (RunningCell, Cell) {
+    std::fs::create_dir_all(folder.join("dev")).expect("a folder");
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
+    for file in ["recipe.toml", "part.step"] {
+        std::fs::copy(configs.join(file), folder.join(file)).expect("the demo's file");
+    }
+    let text = std::fs::read_to_string(configs.join("cell.toml")).expect("the demo's cell");
+    let finer = format!("encoder_step = {STEP}\ncolumns = {COLUMNS}\nrate_hz = {RATE}");
+    let text = text.replace("encoder_step = 200", &finer);
+    let path: PathBuf = folder.join("cell.toml");
+    std::fs::write(&path, text).expect("the cell's file");
+    let mut demo = DemoCell::with_options(DemoOptions {
+        paced,
+        ..DemoOptions::new(1)
+    });
+    for sensor in &mut demo.sensors {
+        sensor.view.columns = COLUMNS;
+    }
+    let playing = demo.start(&folder.join("dev")).expect("the devices");
+    (playing, Cell::read(&path).expect("the cell"))
+}
+
+fn by_stage(cell: &Cell) {
+    let outcome = cell::run(cell, &Cable, &mut |_| {}).expect("an inspection");
+    println!(
+        "{} points, {:.2} s from the last profile to the verdict",
+        outcome.scan.cloud.len(),
+        outcome.verdict_seconds
+    );
+    for (stage, seconds) in &outcome.inspection.seconds {
+        println!("    {stage:<32} {seconds:>7.3} s");
+    }
+}
+
+fn in_the_daemon(cell: Cell, folder: &Path, rounds: usize) {
+    let store = Arc::new(Store::open(&folder.join("store")).expect("the store"));
+    let options = DaemonOptions {
+        simulated: true,
+        ..DaemonOptions::default()
+    };
+    let daemon = Daemon::start(Arc::new(cell), store, Arc::new(Cable), options).expect("a daemon");
+    let handle = daemon.handle();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build()
+        .expect("a runtime");
+    let until = |what: &str, is_so: &dyn Fn(&Snapshot) -> bool| {
+        let mut follow = handle.follow();
+        let waited = runtime.block_on(async {
+            tokio::time::timeout(LONG, follow.wait_for(|s| is_so(s)))
+                .await
+                .map(|found| found.map(|_| ()))
+        });
+        assert!(waited.is_ok(), "{what}: {:#?}", handle.snapshot());
+    };
+    let mut seconds: Vec<f64> = Vec::new();
+    for round in 0..rounds {
+        until("ready", &|s| s.state == State::Ready);
+        let order = Order {
+            part_serial: format!("part {round}"),
+            ..Order::default()
+        };
+        let started = runtime.block_on(handle.start(order, "bench", None, Mode::Single));
+        let id = started.expect("a start").0.id;
+        let at_work = |s: &Snapshot| {
+            let jobs = s.acquiring.iter().chain(&s.queue);
+            jobs.into_iter().any(|job| job.id == id)
+        };
+        let (began, busy) = (Instant::now(), processor_seconds());
+        until("acquired", &|s| !at_work(s));
+        let acquired = Instant::now();
+        let scan = (acquired - began).as_secs_f64();
+        let busy = processor_seconds() - busy;
+        until("concluded", &|s| {
+            s.last.as_ref().is_some_and(|last| last.id == id)
+        });
+        let latency = acquired.elapsed().as_secs_f64();
+        let kept = handle.store().inspection(id).expect("in the history");
+        if round == 0 {
+            println!(
+                "{:?} points, {:?}, scan {scan:.2} s",
+                kept.points, kept.verdict
+            );
+        }
+        println!(
+            "    {round}: {latency:.3} s, {:.1} % of the scan, processor {:.2} cores during the scan",
+            100.0 * latency / scan,
+            busy / scan
+        );
+        seconds.push(latency);
+    }
+    seconds.sort_by(f64::total_cmp);
+    println!(
+        "{rounds} rounds: verdict {:.3} s after the last profile (median), {:.3} s (worst)",
+        seconds[seconds.len() / 2],
+        seconds[seconds.len() - 1]
+    );
+}
+
+/// Processor time that this process has used, s.
+fn processor_seconds() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    let after = stat.rsplit(')').next().unwrap_or_default();
+    let ticks = |at: usize| -> f64 {
+        let field = after.split_whitespace().nth(at);
+        field.and_then(|f| f.parse().ok()).unwrap_or(0.0)
+    };
+    // Fields 14 and 15 of proc(5), in ticks of a hundredth of a second.
+    (ticks(11) + ticks(12)) / 100.0
+}

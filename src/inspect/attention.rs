@@ -1,0 +1,283 @@
+//! Where a scan may show an edge that the nominal does not have: everywhere else the detector need not look.
+//!
+//! The nominal is smooth away from its sharp edges, so a crease of the part is a kink of the deviation from it. The deviation is
+//! fitted by a plane in every patch of a face: where it neither slopes nor scatters there is no edge. A surface that kinks by the
+//! least angle that the detector tells slopes by at least half of it on one side.
+
+use std::collections::hash_map::Entry;
+use std::collections::{HashMap, HashSet};
+
+use foldhash::fast::FixedState;
+use glam::{DMat2, DMat3, DQuat, DVec2, DVec3, IVec3};
+use rayon::prelude::*;
+
+use super::assign::{NO_FACE, Place};
+use super::body::{Body, BodyEdge};
+use crate::points::Neighbors;
+
+/// Width of a patch in spacings: an edge shorter than this is an accident.
+const PATCH: f64 = 8.0;
+
+/// Points without which a patch says nothing.
+const ENOUGH: f64 = 12.0;
+
+/// Half of half the least turn that the detector tells (8 degrees), as a slope: the other half is for a face that is tilted itself.
+const SLOPE: f64 = 0.035;
+
+/// Variance over that of the noise from which on a patch scatters: places differ in noise, and the noise is that of the quiet ones.
+const SCATTER: f64 = 2.0;
+
+/// Standard deviations of chance.
+const CHANCE: f64 = 3.0;
+
+/// Patches around a suspicious one in which an edge would be found.
+const LOOK: i32 = 1;
+
+/// Patches around those that the detector needs to see.
+const SEE: i32 = 2;
+
+/// Points that one task looks at.
+const BLOCK: usize = 1 << 16;
+
+/// A cell of space, about a patch wide.
+type Cell = IVec3;
+
+/// The nominal edges, for telling what lies near one.
+pub(super) struct Outline {
+    along: Neighbors,
+    cells: CellSet,
+    grid: Grid,
+    near_mm: f64,
+}
+
+impl Outline {
+    /// `near_mm` is the distance within which what is found belongs to a nominal edge.
+    pub(super) fn new<B: Body>(nominal: &B, edges: &[BodyEdge], near_mm: f64) -> Self {
+        let grid = Grid::new(PATCH / super::compare::NEAR * near_mm);
+        let mut places = Vec::new();
+        for (e, edge) in edges.iter().enumerate() {
+            let count = (edge.length_mm / (0.5 * near_mm)).ceil().clamp(1.0, 1e5) as usize;
+            let at = |k: usize| edge.length_mm * k as f64 / count as f64;
+            places.extend((0..=count).map(|k| nominal.station(e, at(k)).point));
+        }
+        // A cell is wider than what is near.
+        let cells = places.iter().flat_map(|p| around(grid.cell(*p), 1));
+        Self {
+            cells: cells.collect(),
+            along: Neighbors::new(&places),
+            grid,
+            near_mm,
+        }
+    }
+
+    /// Distance within which what is found belongs to a nominal edge, mm.
+    pub(super) fn near_mm(&self) -> f64 {
+        self.near_mm
+    }
+
+    /// Whether `p` lies near a nominal edge; `hit` is scratch.
+    pub(super) fn is_near(&self, p: DVec3, hit: &mut Vec<(u32, f64)>) -> bool {
+        if !self.cells.contains(&self.grid.cell(p)) {
+            return false;
+        }
+        self.along.nearest(p, 1, hit);
+        hit.first()
+            .is_some_and(|h| h.1 <= self.near_mm * self.near_mm)
+    }
+}
+
+/// What the patches of a scan say, added up point by point.
+#[derive(Default)]
+pub(super) struct Patches {
+    moments: HashMap<(u32, Cell), Moments, FixedState>,
+}
+
+impl Patches {
+    /// Adds points, which lie in the part frame, with their places; the same sums whatever the number of threads.
+    pub(super) fn add(&mut self, positions: &[DVec3], places: &[Place], outline: &Outline) {
+        let blocks: Vec<Vec<((u32, Cell), Moments)>> = positions
+            .par_chunks(BLOCK)
+            .zip(places.par_chunks(BLOCK))
+            .map(|(positions, places)| runs(positions, places, outline))
+            .collect();
+        for (patch, moments) in blocks.into_iter().flatten() {
+            match self.moments.entry(patch) {
+                Entry::Occupied(mut known) => known.get_mut().merge(&moments),
+                Entry::Vacant(new) => {
+                    new.insert(moments);
+                }
+            }
+        }
+    }
+
+    /// Cells whose surface may hold an edge.
+    pub(super) fn suspicious(&self, outline: &Outline, noise_mm: f64) -> CellSet {
+        let suspicious = |((_, cell), moments): (&(u32, Cell), &Moments)| {
+            moments
+                .is_suspicious(outline.grid.size_mm, noise_mm)
+                .then_some(*cell)
+        };
+        self.moments.iter().filter_map(suspicious).collect()
+    }
+}
+
+/// The moments of the patches that a block of points touches, a patch as often as the scan lines cross it.
+fn runs(positions: &[DVec3], places: &[Place], outline: &Outline) -> Vec<((u32, Cell), Moments)> {
+    let mut hit = Vec::new();
+    let mut runs: Vec<((u32, Cell), Moments)> = Vec::new();
+    for (p, place) in positions.iter().zip(places) {
+        if place.face == NO_FACE || outline.is_near(*p, &mut hit) {
+            continue;
+        }
+        let cell = outline.grid.cell(*p);
+        let patch = (place.face, cell);
+        let offset = *p - outline.grid.centre(cell);
+        match runs.last_mut().filter(|(last, _)| *last == patch) {
+            Some((_, moments)) => moments.add(offset, place),
+            None => {
+                let mut moments = Moments::default();
+                moments.add(offset, place);
+                runs.push((patch, moments));
+            }
+        }
+    }
+    runs
+}
+
+/// The points on which the detector is to look, and those of them whose edges count.
+pub(super) struct Attended {
+    /// Indices of points, ascending.
+    pub(super) seen: Vec<usize>,
+    /// Of every one of `seen`, whether an edge there counts.
+    pub(super) counts: Vec<bool>,
+}
+
+/// The points of `positions` around `cells` and around `places`.
+pub(super) fn attended(
+    positions: &[DVec3],
+    outline: &Outline,
+    cells: &CellSet,
+    places: &[DVec3],
+) -> Attended {
+    let grown = |reach: i32| -> CellSet {
+        let places = places.iter().map(|p| outline.grid.cell(*p));
+        let all = cells.iter().copied().chain(places);
+        all.flat_map(|cell| around(cell, reach)).collect()
+    };
+    let (look, see) = (grown(LOOK), grown(LOOK + SEE));
+    let found: Vec<(usize, bool)> = positions
+        .par_iter()
+        .enumerate()
+        .filter_map(|(i, p)| {
+            let cell = outline.grid.cell(*p);
+            see.contains(&cell)
+                .then(|| (i, look.contains(&cell)))
+        })
+        .collect();
+    let (seen, counts) = found.into_iter().unzip();
+    Attended { seen, counts }
+}
+
+fn around(cell: Cell, reach: i32) -> impl Iterator<Item = Cell> {
+    let range = -reach..=reach;
+    range.clone().flat_map(move |x| {
+        let range = range.clone();
+        range.clone().flat_map(move |y| {
+            range
+                .clone()
+                .map(move |z| cell.wrapping_add(IVec3::new(x, y, z)))
+        })
+    })
+}
+
+/// Cells in a turned lattice: what runs along an axis of the part does not run along their walls.
+struct Grid {
+    turn: DQuat,
+    size_mm: f64,
+}
+
+impl Grid {
+    fn new(size_mm: f64) -> Self {
+        Self {
+            turn: DQuat::from_axis_angle(DVec3::new(0.48, 0.6, -0.64), 0.5217),
+            size_mm: size_mm.max(1e-9),
+        }
+    }
+
+    fn cell(&self, p: DVec3) -> Cell {
+        (self.turn * p / self.size_mm).floor().as_ivec3()
+    }
+
+    fn centre(&self, cell: Cell) -> DVec3 {
+        self.turn.conjugate() * ((cell.as_dvec3() + 0.5) * self.size_mm)
+    }
+}
+
+/// Sums over the points of a patch: places about the middle of the cell, deviations, normals.
+#[derive(Debug, Clone, Copy, Default)]
+struct Moments {
+    count: f64,
+    place: DVec3,
+    places: DMat3,
+    deviation: f64,
+    by_place: DVec3,
+    squares: f64,
+    normal: DVec3,
+}
+
+impl Moments {
+    fn add(&mut self, offset: DVec3, place: &Place) {
+        let d = place.deviation_mm;
+        self.count += 1.0;
+        self.place += offset;
+        self.places += DMat3::from_cols(offset * offset.x, offset * offset.y, offset * offset.z);
+        self.deviation += d;
+        self.by_place += offset * d;
+        self.squares += d * d;
+        self.normal += place.normal;
+    }
+
+    fn merge(&mut self, other: &Self) {
+        self.count += other.count;
+        self.place += other.place;
+        self.places += other.places;
+        self.deviation += other.deviation;
+        self.by_place += other.by_place;
+        self.squares += other.squares;
+        self.normal += other.normal;
+    }
+
+    /// Whether the deviation slopes or scatters more than noise does.
+    fn is_suspicious(&self, size_mm: f64, noise_mm: f64) -> bool {
+        let Some(normal) = self.normal.try_normalize() else {
+            return self.count > 0.0;
+        };
+        if self.count < ENOUGH {
+            return false;
+        }
+        let n = self.count;
+        let (u, v) = normal.any_orthonormal_pair();
+        let flat = |p: DVec3| DVec2::new(p.dot(u), p.dot(v));
+        let mean = flat(self.place / n);
+        let second = [u, v].map(|axis| flat(self.places * axis));
+        let spread = DMat2::from_cols(
+            second[0] - n * mean * mean.x,
+            second[1] - n * mean * mean.y,
+        );
+        let by_place = flat(self.by_place) - mean * self.deviation;
+        let squares = self.squares - self.deviation * self.deviation / n;
+        // A patch that is a mere line along a border slopes along it only.
+        let ridge = DMat2::from_diagonal(DVec2::splat(1e-4 * n * size_mm * size_mm));
+        let slope = (spread + ridge).inverse() * by_place;
+        let rest = (squares - slope.dot(by_place)).max(0.0) / (n - 3.0);
+        let variance = noise_mm * noise_mm;
+        if rest > variance * (SCATTER + CHANCE * (2.0 / (n - 3.0)).sqrt()) {
+            return true;
+        }
+        let along = slope.normalize_or_zero();
+        let held = along.dot(spread * along).max(1e-12 * size_mm * size_mm);
+        slope.length() > SLOPE + CHANCE * (rest.max(variance) / held).sqrt()
+    }
+}
+
+pub(super) type CellSet = HashSet<Cell, FixedState>;

@@ -1,0 +1,448 @@
+//! An inspection that goes on while the scan runs, so that little is left to do when it ends.
+//!
+//! The scan comes in pieces. When enough of it is there the pose is found and every piece is laid on the nominal: places, sights from
+//! edges, patches. Flanks and shapes are measured as the points come, and again only where points have joined. At the end the pose is
+//! solved for by all points; the values follow the small motion to it by first order, which for plane faces is exact. Where the motion
+//! is not small, everything is laid again.
+
+use std::collections::HashSet;
+
+use foldhash::fast::FixedState;
+use glam::{DMat3, IVec3};
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::align::{Aligned, Candidates, LaidPoint, Scan, align_again, align_keeping};
+use super::assign::{Place, Surface, towards};
+use super::attention::{Outline, Patches};
+use super::body::Body;
+use super::collect::Layer;
+use super::compare::{self, Scanned};
+use super::measure::{MeasureSettings, MeasuredEdge};
+use super::measuring::{Measuring, centre};
+use super::recipe::Resolved;
+use super::result::{Inspection, ScanEstimate, Verdict};
+use super::{
+    Datums, GATE, Request, Stages, Taken, all_edge_facts, judge_all, measure_settings, resolve,
+};
+use crate::geometry::RigidTransform;
+use crate::points::spacing::Estimator;
+use crate::points::{Frame, Neighbors, PointCloud, Spacing};
+
+/// Cells of the sketch over the half-diagonal of the part: some ten thousand of its points lie on a part.
+const SKETCH: f64 = 100.0;
+
+/// Points of the sketch without which no pose is looked for.
+const SKETCH_ENOUGH: usize = 1500;
+
+/// The pose is found anew when this many times as many points are there: half of the scan is then laid twice.
+const AGAIN: f64 = 2.2;
+
+/// Points that solve for the last pose at most: it is then known to a hundredth of what a station is.
+const POSE_POINTS: usize = 400_000;
+
+/// Relative changes of spacing and noise, as estimated by a part of the scan and by all of it, that change no station.
+const SAME_SPACING: f64 = 0.03;
+const SAME_NOISE: f64 = 0.15;
+
+/// Motion over the noise, at the half-diagonal, that values follow by first order: on a face of 5 mm radius 20 um leave 0.04 um.
+const SMALL_MOTION: f64 = 2.0;
+
+/// A part that is being scanned and measured.
+pub struct Growing<'a, B: Body> {
+    nominal: &'a B,
+    request: Request<'a>,
+    surface: Surface<'a, B>,
+    datums: Datums,
+    resolved: Vec<Resolved>,
+    /// What the recipe had wrong.
+    findings: Vec<String>,
+    pieces: Vec<Piece>,
+    points: usize,
+    estimator: Estimator,
+    sketch: PointCloud,
+    cells: HashSet<IVec3, FixedState>,
+    base: Option<Base<'a, B>>,
+    breaks: Vec<super::measuring::Breaks>,
+}
+
+/// Points of consecutive profiles.
+struct Piece {
+    machine: PointCloud,
+    /// The same in the part frame of the base.
+    part: PointCloud,
+    places: Vec<Place>,
+    rims: Vec<f32>,
+}
+
+impl Piece {
+    fn layer(&self) -> Layer<'_> {
+        Layer::new(&self.part, &self.places)
+    }
+}
+
+/// What all pieces are laid by.
+struct Base<'a, B: Body> {
+    pose: RigidTransform,
+    spacing: Spacing,
+    noise_mm: f64,
+    candidates: Candidates,
+    outline: Outline,
+    patches: Patches,
+    measuring: Measuring<'a, B>,
+    /// Points of the scan when the pose was found.
+    points: usize,
+}
+
+/// What is known of an edge while the scan runs. Nothing is judged before its end.
+#[derive(Debug, Clone, PartialEq, Serialize, utoipa::ToSchema)]
+pub struct EdgeSoFar {
+    /// Id, or name in the recipe.
+    pub id: String,
+    /// Share of its stations that were measured.
+    pub coverage: f64,
+    /// Means of d1 and d2 over them, mm; none before the first.
+    pub mean_d_mm: Option<[f64; 2]>,
+    /// The d of all stations that is farthest from zero, mm.
+    pub worst_d_mm: Option<f64>,
+    /// Places of the measured stations, machine frame, mm, and the d that is farthest from zero.
+    pub stations: Vec<[f32; 4]>,
+}
+
+impl<'a, B: Body> Growing<'a, B> {
+    /// Without points. Samples the nominal, which takes some tenths of a second.
+    pub fn new(nominal: &'a B, request: Request<'a>) -> Self {
+        let mut findings = Vec::new();
+        let datums = Datums::of(nominal, request.recipe, &mut findings);
+        let facts = all_edge_facts(nominal);
+        let (resolved, of_recipe) = resolve(nominal, &facts, request.recipe);
+        findings.extend(of_recipe);
+        Self {
+            nominal,
+            request,
+            surface: Surface::new(nominal),
+            datums,
+            resolved,
+            findings,
+            pieces: Vec::new(),
+            points: 0,
+            estimator: Estimator::default(),
+            sketch: PointCloud::from_positions(Frame::Machine, Vec::new()),
+            cells: HashSet::default(),
+            base: None,
+            breaks: Vec::new(),
+        }
+    }
+
+    /// Number of points so far.
+    pub fn len(&self) -> usize {
+        self.points
+    }
+
+    /// Whether there is no point yet.
+    pub fn is_empty(&self) -> bool {
+        self.points == 0
+    }
+
+    /// Takes the points of consecutive profiles of one view, some ten thousand at a time, with the lattice; all pieces name the same views.
+    pub fn push(&mut self, piece: PointCloud) {
+        if piece.is_empty() {
+            return;
+        }
+        self.points += piece.len();
+        let neighbors = Neighbors::new(&piece.positions);
+        self.estimator.add(&piece, &neighbors);
+        self.draw(&piece);
+        self.pieces.push(Piece {
+            machine: piece,
+            part: PointCloud::from_positions(Frame::Part, Vec::new()),
+            places: Vec::new(),
+            rims: Vec::new(),
+        });
+        let last = self.pieces.len() - 1;
+        let due = |base: &Base<'_, B>| self.points as f64 > AGAIN * base.points as f64;
+        if self.base.as_ref().is_none_or(due) {
+            self.find_base();
+        } else {
+            self.lay(last);
+        }
+    }
+
+    /// Measures what has been laid; the edges as they are now.
+    pub fn measure(&mut self) -> Vec<EdgeSoFar> {
+        let Some(edges) = self.measured(None) else {
+            return Vec::new();
+        };
+        let machine = self.base.as_ref().map(|base| base.pose.inverse());
+        let machine = machine.unwrap_or(RigidTransform::IDENTITY);
+        let named = edges.iter().zip(self.nominal.edges()).zip(&self.resolved);
+        named
+            .map(|((edge, nominal), asked)| {
+                let id = asked.name.clone().unwrap_or(nominal.id);
+                so_far(id, edge, &machine)
+            })
+            .collect()
+    }
+
+    /// The inspection, as [`super::inspect`] makes it of the same points: values agree to a fraction of their uncertainty, not in every bit.
+    pub fn finish(mut self) -> Inspection {
+        let progress = self.request.progress;
+        let mut stages = Stages::new(progress);
+        stages.begin("alignment");
+        self.renew_base();
+        let Some(aligned) = self.aligned() else {
+            return self.all_at_once();
+        };
+        let Aligned {
+            mut alignment,
+            findings: of_alignment,
+            ..
+        } = aligned;
+        if self.datums.unknown {
+            alignment.status = Verdict::NotDecidable;
+        }
+        stages.begin("faces of the points");
+        let motion = self.follow(alignment.part_from_machine);
+        stages.begin("edges");
+        let mut findings = std::mem::take(&mut self.findings);
+        findings.extend(of_alignment);
+        let Some(base) = &self.base else {
+            return self.all_at_once();
+        };
+        let estimate = ScanEstimate {
+            spacing: base.spacing,
+            noise_mm: base.noise_mm,
+        };
+        let settings = MeasureSettings {
+            pose_covariance: alignment.covariance,
+            ..measure_settings(&base.spacing, base.noise_mm, &self.request, &mut findings)
+        };
+        let measured = self.measured(Some((&motion, &settings)));
+        stages.begin("comparison of edges found");
+        let (Some(measured), Some(base)) = (measured, &self.base) else {
+            return self.all_at_once();
+        };
+        let clouds: Vec<&PointCloud> = self.pieces.iter().map(|piece| &piece.part).collect();
+        let scanned = Scanned {
+            clouds: &clouds,
+            patches: &base.patches,
+            outline: &base.outline,
+            spacing: base.spacing,
+            noise_mm: base.noise_mm,
+        };
+        let edges = base.measuring.edges();
+        let compared = compare::compare(&scanned, (edges, &measured));
+        let taken = Taken {
+            alignment,
+            findings,
+            measured,
+            compared,
+            trials: None,
+            estimate,
+        };
+        judge_all(self.nominal, &self.request, (edges, &self.resolved), taken, stages)
+    }
+
+    /// As if all points had come at once: for scans of which the pieces say too little.
+    fn all_at_once(&self) -> Inspection {
+        let clouds = self.pieces.iter().map(|piece| &piece.machine);
+        let mut all = PointCloud {
+            frame: Frame::Machine,
+            views: self.sketch.views.clone(),
+            ..PointCloud::from_positions(Frame::Machine, Vec::new())
+        };
+        for cloud in clouds {
+            all.positions.extend(&cloud.positions);
+            all.origins.extend(&cloud.origins);
+        }
+        super::inspect(&all, self.nominal, &self.request)
+    }
+
+    /// Adds to the sketch one point of every cell that has none.
+    fn draw(&mut self, piece: &PointCloud) {
+        let cell_mm = self.surface.size_mm() / SKETCH;
+        if self.sketch.views.is_empty() {
+            self.sketch.views.clone_from(&piece.views);
+        }
+        for (i, p) in piece.positions.iter().enumerate() {
+            if p.is_finite() && self.cells.insert((*p / cell_mm).floor().as_ivec3()) {
+                self.sketch.positions.push(*p);
+                self.sketch.origins.extend(piece.origins.get(i));
+            }
+        }
+    }
+
+    /// Finds the pose by the points so far, and lays them all.
+    fn find_base(&mut self) {
+        let Some((spacing, noise_mm)) = self.estimator.estimate() else {
+            return;
+        };
+        if self.sketch.len() < SKETCH_ENOUGH {
+            return;
+        }
+        let neighbors = Neighbors::new(&self.sketch.positions);
+        let scan = sketch_scan(&self.sketch, &neighbors, noise_mm);
+        let options = self.datums.options(&self.request);
+        let (aligned, candidates) =
+            align_keeping(&scan, &self.surface, self.request.start, &options);
+        self.set_base(aligned.alignment.part_from_machine, (spacing, noise_mm), candidates);
+    }
+
+    fn set_base(&mut self, pose: RigidTransform, known: (Spacing, f64), candidates: Candidates) {
+        let (spacing, noise_mm) = known;
+        let settings = measure_settings(&spacing, noise_mm, &self.request, &mut Vec::new());
+        let steps: Vec<Option<f64>> = self.resolved.iter().map(|r| r.station_step_mm).collect();
+        let measuring = Measuring::new(&self.surface, &settings, &steps, false);
+        let near_mm = compare::near_mm(&spacing);
+        self.base = Some(Base {
+            pose,
+            spacing,
+            noise_mm,
+            candidates,
+            outline: Outline::new(self.nominal, measuring.edges(), near_mm),
+            patches: Patches::default(),
+            measuring,
+            points: self.points,
+        });
+        for piece in 0..self.pieces.len() {
+            self.lay(piece);
+        }
+    }
+
+    /// Lays one piece on the nominal: pieces are laid in their order.
+    fn lay(&mut self, piece: usize) {
+        let Some(base) = &mut self.base else {
+            return;
+        };
+        let piece = &mut self.pieces[piece];
+        let pose = base.pose;
+        let turn = DMat3::from_quat(pose.rotation);
+        piece.part = piece.machine.map(
+            Frame::Part,
+            |p| turn * p + pose.translation,
+            |v| pose.vector(v),
+        );
+        let gate_mm = GATE * self.surface.size_mm();
+        let part = &piece.part;
+        let surface = &self.surface;
+        let laid: Vec<(Place, f32)> = (0..part.len())
+            .into_par_iter()
+            .with_min_len(512)
+            .map_init(Vec::new, |found, i| {
+                let p = part.positions[i];
+                let (place, rim) = surface.place_and_rim(p, towards(part, i), gate_mm, found);
+                (place, rim as f32)
+            })
+            .collect();
+        (piece.places, piece.rims) = laid.into_iter().unzip();
+        base.patches
+            .add(&piece.part.positions, &piece.places, &base.outline);
+        base.measuring.add(&piece.layer());
+    }
+
+    /// Finds a base where there is none, or anew where spacing or noise have turned out otherwise.
+    fn renew_base(&mut self) {
+        let Some((spacing, noise_mm)) = self.estimator.estimate() else {
+            return;
+        };
+        let differs = |a: f64, b: f64, by: f64| (a - b).abs() > by * b.abs();
+        let other = |base: &Base<'_, B>| {
+            differs(base.spacing.along_mm, spacing.along_mm, SAME_SPACING)
+                || differs(base.spacing.across_mm, spacing.across_mm, SAME_SPACING)
+                || differs(base.noise_mm, noise_mm, SAME_NOISE)
+        };
+        if self.base.as_ref().is_none_or(other) {
+            self.find_base();
+        }
+    }
+
+    /// The pose by all points.
+    fn aligned(&self) -> Option<Aligned> {
+        let base = self.base.as_ref()?;
+        let neighbors = Neighbors::new(&self.sketch.positions);
+        let scan = sketch_scan(&self.sketch, &neighbors, base.noise_mm);
+        let step = self.points.div_ceil(POSE_POINTS).max(1);
+        let laid = |piece: &Piece| {
+            (0..piece.places.len())
+                .step_by(step)
+                .map(|i| LaidPoint {
+                    point: piece.part.positions[i],
+                    place: piece.places[i],
+                    rim_mm: f64::from(piece.rims[i]),
+                })
+                .collect::<Vec<_>>()
+        };
+        let laid: Vec<LaidPoint> = self.pieces.par_iter().flat_map_iter(laid).collect();
+        let options = self.datums.options(&self.request);
+        Some(align_again(
+            &scan,
+            &self.surface,
+            self.request.start,
+            &options,
+            &base.candidates,
+            (base.pose, &laid, base.spacing.along_mm),
+        ))
+    }
+
+    /// The motion from the base to `pose` if values can follow it; otherwise everything is laid at `pose`.
+    fn follow(&mut self, pose: RigidTransform) -> RigidTransform {
+        let Some(base) = &self.base else {
+            return RigidTransform::IDENTITY;
+        };
+        let motion = pose * base.pose.inverse();
+        let moved = super::align::Twist::logarithm(&motion).size(self.surface.size_mm());
+        if moved <= SMALL_MOTION * base.noise_mm {
+            return motion;
+        }
+        tracing::debug!(moved_mm = moved, "the pose has moved too far: all points are laid again");
+        let known = (base.spacing, base.noise_mm);
+        self.set_base(pose, known, Vec::new());
+        RigidTransform::IDENTITY
+    }
+
+    /// All edges, as the flanks and shapes are now; after a motion, with the settings that hold at the end.
+    fn measured(
+        &mut self,
+        end: Option<(&RigidTransform, &MeasureSettings)>,
+    ) -> Option<Vec<MeasuredEdge>> {
+        let base = self.base.as_mut()?;
+        let layers: Vec<Layer<'_>> = self.pieces.iter().map(Piece::layer).collect();
+        base.measuring.measure(&layers);
+        self.breaks = base.measuring.breaks(&layers);
+        let own = *base.measuring.settings();
+        let (motion, settings) = end.unwrap_or((&RigidTransform::IDENTITY, &own));
+        let centre = motion.point(centre(&layers));
+        Some(base.measuring.combined(&self.breaks, motion, settings, centre))
+    }
+}
+
+/// The sketch as a scan of its own: its spacing is that of its cells.
+fn sketch_scan<'s>(sketch: &'s PointCloud, neighbors: &'s Neighbors, noise_mm: f64) -> Scan<'s> {
+    Scan {
+        cloud: sketch,
+        neighbors,
+        spacing: crate::points::spacing(sketch, neighbors),
+        noise_mm,
+    }
+}
+
+fn so_far(id: String, edge: &MeasuredEdge, machine: &RigidTransform) -> EdgeSoFar {
+    let total = edge.stations.len().max(1) as f64;
+    let values = edge.stations.iter().filter_map(|s| s.outcome.as_ref().ok());
+    let stations: Vec<[f32; 4]> = values
+        .map(|m| {
+            let [a, b] = m.d_mm;
+            let worse = if a.abs() > b.abs() { a } else { b };
+            let p = machine.point(m.point);
+            [p.x, p.y, p.z, worse].map(|x| x as f32)
+        })
+        .collect();
+    let farther = |a: f64, b: f64| if b.abs() > a.abs() { b } else { a };
+    EdgeSoFar {
+        id,
+        coverage: stations.len() as f64 / total,
+        mean_d_mm: edge.mean.map(|mean| mean.d_mm),
+        worst_d_mm: stations.iter().map(|s| f64::from(s[3])).reduce(farther),
+        stations,
+    }
+}
