@@ -5,6 +5,7 @@
 
 #![allow(clippy::print_stdout)] // what a bench is for
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -13,7 +14,10 @@ use acies::cell::{self, Daemon, DaemonOptions, Mode, Snapshot, State};
 use acies::config::Cell;
 use acies::store::{Order, Store};
 use acies_drivers::link::cable::Cable;
-use acies_simulators::demo_cell::{DemoCell, DemoOptions, RunningCell};
+use acies_simulators::demo_cell::{DemoCell, DemoOptions};
+use acies_simulators::grbl::SimulatedProbe;
+use acies_simulators::open_profile::SimulatedProfiler;
+use acies_simulators::wire::Wire;
 
 /// Points of a profile.
 const COLUMNS: u32 = 3200;
@@ -41,7 +45,7 @@ fn main() {
 }
 
 /// The demo's cell with finer profiles.
-fn set_up(folder: &Path, paced: bool) -> (RunningCell, Cell) {
+fn set_up(folder: &Path, paced: bool) -> (([SimulatedProfiler; 2], SimulatedProbe), Cell) {
     std::fs::create_dir_all(folder.join("dev")).expect("a folder");
     let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
     for file in ["recipe.toml", "part.step"] {
@@ -49,9 +53,8 @@ fn set_up(folder: &Path, paced: bool) -> (RunningCell, Cell) {
     }
     let text = std::fs::read_to_string(configs.join("cell.toml")).expect("the demo's cell");
     let finer = format!("encoder_step = {STEP}\ncolumns = {COLUMNS}\nrate_hz = {RATE}");
-    let text = text.replace("encoder_step = 200", &finer);
+    let mut text = text.replace("encoder_step = 200", &finer);
     let path: PathBuf = folder.join("cell.toml");
-    std::fs::write(&path, text).expect("the cell's file");
     let mut demo = DemoCell::with_options(DemoOptions {
         paced,
         ..DemoOptions::new(1)
@@ -59,8 +62,20 @@ fn set_up(folder: &Path, paced: bool) -> (RunningCell, Cell) {
     for sensor in &mut demo.sensors {
         sensor.view.columns = COLUMNS;
     }
-    let playing = demo.start(&folder.join("dev")).expect("the devices");
-    (playing, Cell::read(&path).expect("the cell"))
+    // Twenty megabytes in ten seconds are more than serial lines are made for.
+    let mut profiler = |which: usize, port: &str| {
+        let wire = Wire::tcp(SocketAddr::from(([127, 0, 0, 1], 0))).expect("a port");
+        let address = format!("address = {:?}", wire.name());
+        text = text.replace(&format!("port = \"./dev/{port}\""), &address);
+        demo.start_profiler(which, wire).expect("a profiler")
+    };
+    let profilers = [profiler(0, "ttyLEFT"), profiler(1, "ttyRIGHT")];
+    let wire = Wire::pty(&folder.join("dev/ttyPROBE")).expect("a pseudo-terminal");
+    // Touches in real time would only lengthen what comes before the scan.
+    demo.options.paced = false;
+    let probe = demo.start_probe(wire).expect("a probe");
+    std::fs::write(&path, text).expect("the cell's file");
+    ((profilers, probe), Cell::read(&path).expect("the cell"))
 }
 
 fn by_stage(cell: &Cell) {

@@ -8,6 +8,7 @@ mod daemon;
 mod devices;
 mod job;
 mod live;
+mod meanwhile;
 mod recipes;
 mod state;
 mod status;
@@ -22,7 +23,7 @@ use crate::store::StoreError;
 
 pub use daemon::{Command, Daemon, DaemonOptions, Handle, Refusal, Started};
 pub use job::{Outcome, Part, Step, check_recipe, read_part, read_recipe, report_of, run};
-pub use live::{Live, LivePoints, LiveProfile};
+pub use live::{Live, LiveEdges, LivePoints, LiveProfile};
 pub use state::{Mode, State};
 pub use status::{DeviceState, DeviceStatus, JobStatus, Snapshot};
 

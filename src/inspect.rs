@@ -291,12 +291,7 @@ fn judge_all<B: Body>(
         .map(|e| e.verdict)
         .chain(corners.iter().map(|c| c.verdict))
         .chain(gaps.iter().map(|g| g.verdict))
-        .chain(compared_verdict(
-            &compared,
-            resolved,
-            edges,
-            request.recipe,
-        ))
+        .chain(compared_verdict(&compared, resolved, edges, request.recipe))
         .chain(environment_verdict(request, &mut findings));
     let verdict = verdict::judge_part(values, alignment.status);
     Inspection {

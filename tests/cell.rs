@@ -10,6 +10,7 @@ use acies::cell::{
     Command, Daemon, DaemonOptions, DeviceState, Handle, Mode, Refusal, Snapshot, State,
 };
 use acies::config::Cell;
+use acies::inspect::{Request, Start, inspect};
 use acies::report::Report;
 use acies::report::wire::Status;
 use acies::store::{History, Inspection, Order, Phase, ScanReader, Store};
@@ -18,6 +19,7 @@ use acies_drivers::device::{Claim, Identity, Instrument, Losses, Probe, Profiler
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
+use acies_simulators::demo_cell::DemoCell;
 
 /// Nothing here takes longer than seconds; a test that waits for this long has failed.
 const LONG: Duration = Duration::from_secs(120);
@@ -700,4 +702,53 @@ fn a_daemon_that_ends_in_mid_scan_leaves_an_aborted_part() {
         .expect("it is in the history");
     assert_eq!(inspection.phase, Phase::Aborted);
     assert_eq!(inspection.scan_whole, Some(false));
+}
+
+#[test]
+fn what_was_measured_during_the_scan_is_what_is_measured_after_it() {
+    let folder = std::env::temp_dir().join(format!("acies-meanwhile-{}", std::process::id()));
+    fs::create_dir_all(folder.join("dev")).unwrap();
+    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
+    for file in ["cell.toml", "recipe.toml", "part.step"] {
+        fs::copy(configs.join(file), folder.join(file)).unwrap();
+    }
+    // Stations of a given length: their number does not hang on the last digit of the spacing.
+    let recipe = fs::read_to_string(folder.join("recipe.toml")).unwrap();
+    let recipe = format!("station_step_mm = 2.0\n{recipe}");
+    fs::write(folder.join("recipe.toml"), recipe).unwrap();
+    let playing = DemoCell::new(5).start(&folder.join("dev")).unwrap();
+    let cell = Cell::read(&folder.join("cell.toml")).unwrap();
+    let outcome = acies::cell::run(&cell, &Cable, &mut |_| {}).unwrap();
+    drop(playing);
+    let meanwhile = &outcome.inspection;
+    let start = Start::Rough(cell.machine_from_part.inverse());
+    let request = Request {
+        touches: &outcome.touches,
+        ..Request::new(&outcome.part.recipe, start)
+    };
+    let afterwards = inspect(&outcome.scan.cloud, &outcome.part.nominal, &request);
+    assert_eq!(meanwhile.verdict, afterwards.verdict);
+    assert_eq!(meanwhile.alignment.status, afterwards.alignment.status);
+    let (mut compared, mut squares) = (0, 0.0);
+    for (a, b) in meanwhile.edges.iter().zip(&afterwards.edges) {
+        assert_eq!(a.stations.len(), b.stations.len());
+        assert_eq!(a.verdict, b.verdict, "{}", a.id);
+        for (a, b) in a.stations.iter().zip(&b.stations) {
+            let (Some(a), Some(b)) = (&a.measured, &b.measured) else {
+                assert_eq!(a.measured.is_some(), b.measured.is_some(), "{a:?} {b:?}");
+                continue;
+            };
+            compared += 1;
+            for i in 0..2 {
+                // Poses and noise come from other choices of the same points, and a station may leave out a few points more.
+                let apart = (a.d_mm[i] - b.d_mm[i]).abs() / b.u_d_mm[i];
+                assert!(apart < 1.0, "{a:?} {b:?}");
+                squares += apart * apart;
+            }
+        }
+    }
+    assert!(compared > 200, "{compared}");
+    let rms = (squares / f64::from(2 * compared)).sqrt();
+    assert!(rms < 0.2, "{rms} of the standard uncertainty");
+    fs::remove_dir_all(&folder).unwrap();
 }

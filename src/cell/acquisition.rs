@@ -15,9 +15,11 @@ use super::CellError;
 use super::daemon::{Event, give_back};
 use super::devices::{self, Supervisor, chain, name_of};
 use super::job::{
-    Acquired, Instruments, JobWatch, Step, acquire, as_carrier, as_probe, as_profiler, step_of,
+    Acquired, Instruments, JobWatch, Part, Step, acquire, as_carrier, as_probe, as_profiler,
+    step_of,
 };
 use super::live::Live;
+use super::meanwhile::Show;
 use crate::acquire::{Profiling, ScanEvent, ScanWatch};
 use crate::config::Cell;
 use crate::store::{ScanWriter, StoredView};
@@ -29,6 +31,7 @@ const TELL_EVERY: Duration = Duration::from_millis(100);
 pub(super) struct Acquisition {
     pub job: i64,
     pub cell: Arc<Cell>,
+    pub part: Arc<Part>,
     pub supervisors: Arc<Vec<Supervisor>>,
     pub live: Arc<Live>,
     pub events: Sender<Event>,
@@ -93,7 +96,8 @@ fn work(acquisition: &Acquisition, writer: &mut Writer) -> Result<Acquired, Cell
         told: None,
         lost: Vec::new(),
     };
-    let result = acquire(&acquisition.cell, &mut instruments, &mut follower);
+    let part = &acquisition.part;
+    let result = acquire(&acquisition.cell, part, &mut instruments, &mut follower);
     let lost = std::mem::take(&mut follower.lost);
     let failed_probe = match &result {
         Err(CellError::Touch { device, .. }) => Some(device.clone()),
@@ -229,5 +233,10 @@ impl JobWatch for Follower<'_> {
             job: self.acquisition.job,
             step,
         });
+    }
+
+    fn show(&mut self) -> Option<Show> {
+        let (live, job) = (self.acquisition.live.clone(), self.acquisition.job);
+        Some(Box::new(move |edges| live.measured(job, edges)))
     }
 }

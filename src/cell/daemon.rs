@@ -157,7 +157,6 @@ struct Job {
 struct Work {
     job: i64,
     part_name: String,
-    part: Arc<Part>,
     acquired: Acquired,
     findings: Vec<String>,
     created: SystemTime,
@@ -723,7 +722,7 @@ impl Running {
             return;
         }
         self.continue_order();
-        let Some(mut job) = self.queue.pop_front() else {
+        let (Some(part), Some(mut job)) = (self.part.clone(), self.queue.pop_front()) else {
             self.snapshot.mode = Mode::Single;
             return;
         };
@@ -740,6 +739,7 @@ impl Running {
         let acquisition = Acquisition {
             job: id,
             cell: self.cell.clone(),
+            part,
             supervisors: self.supervisors.clone(),
             live: self.live.clone(),
             events: self.events.clone(),
@@ -832,8 +832,8 @@ impl Running {
             }
         }
         let failed = result.is_err();
-        match (result, self.part.clone()) {
-            (Ok(acquired), Some(part)) => {
+        match result {
+            Ok(acquired) => {
                 self.count(&acquired);
                 let now = SystemTime::now();
                 if let Err(error) = self
@@ -847,7 +847,6 @@ impl Running {
                 let work = Work {
                     job: id,
                     part_name: job.status.part_serial.clone(),
-                    part,
                     acquired: *acquired,
                     findings: std::mem::take(&mut job.findings),
                     created: now,
@@ -862,8 +861,7 @@ impl Running {
                     self.abort(id, "the computing thread is gone; restart the daemon");
                 }
             }
-            (Err(error), _) => self.abort(id, &chain(&error)),
-            (Ok(_), None) => self.abort(id, "the recipe was taken away meanwhile"),
+            Err(error) => self.abort(id, &chain(&error)),
         }
         if failed {
             // Part after part without anybody watching ends with the first one that fails.
@@ -1051,7 +1049,7 @@ fn start_computing(
 }
 
 fn compute(cell: &Cell, store: &Store, work: Work, simulated: bool) -> Result<Inspection, String> {
-    let mut outcome = conclude(cell, &work.part, work.acquired, work.created);
+    let mut outcome = conclude(cell, work.acquired, work.created);
     outcome.inspection.findings.extend(work.findings);
     let mut report = report_of(&outcome, &work.part_name, work.created, None);
     report.simulated = simulated;

@@ -10,6 +10,7 @@ use acies_drivers::link::Links;
 use glam::DVec3;
 
 use super::CellError;
+use super::meanwhile::{Feeding, Meanwhile, Show};
 use crate::acquire::{Carrier, Profiling, Scan, ScanEvent, ScanWatch, scan, scan_carried};
 use crate::config::{CarrierConfig, Cell, ProbeConfig};
 use crate::inspect::result::{Inspection, Verdict};
@@ -73,6 +74,8 @@ pub struct Outcome {
     pub part: Arc<Part>,
     /// The probes, by name.
     pub probes: Vec<(String, Identity)>,
+    /// Contacts of the probes with the part, machine frame.
+    pub touches: Vec<inspect::Touch>,
     /// What was found.
     pub inspection: Inspection,
     /// From the first profile's start to the last profile, s.
@@ -95,12 +98,21 @@ pub(super) struct Acquired {
     pub probes: Vec<(String, Identity)>,
     pub scan_seconds: f64,
     pub ended: Instant,
+    /// What the part is compared with and judged by.
+    pub part: Arc<Part>,
+    /// The inspection that began with the scan.
+    pub meanwhile: Option<Meanwhile>,
 }
 
 /// Who follows the part of a job that the devices do.
 pub(super) trait JobWatch: ScanWatch {
     /// A step outside of the scan.
     fn step(&mut self, step: Step);
+
+    /// Who is shown the edges while they are measured.
+    fn show(&mut self) -> Option<Show> {
+        None
+    }
 }
 
 /// Lets a closure that takes [`Step`]s follow a job.
@@ -186,10 +198,10 @@ pub fn run(
 ) -> Result<Outcome, CellError> {
     let part = Arc::new(read_part(cell)?);
     let mut instruments = open_all(cell, links, watch)?;
-    let acquired = acquire(cell, &mut instruments, &mut Told(watch))?;
+    let acquired = acquire(cell, &part, &mut instruments, &mut Told(watch))?;
     drop(instruments);
     watch(Step::Inspecting);
-    Ok(conclude(cell, &part, acquired, SystemTime::now()))
+    Ok(conclude(cell, acquired, SystemTime::now()))
 }
 
 fn open_all(
@@ -282,6 +294,7 @@ fn wrong_kind(device: &str, found: &Instrument, expected: &'static str) -> CellE
 /// [`CellError::Touch`], [`CellError::Scan`], and [`CellError::GivenUp`] between two touches.
 pub(super) fn acquire(
     cell: &Cell,
+    part: &Arc<Part>,
     instruments: &mut Instruments,
     watch: &mut dyn JobWatch,
 ) -> Result<Acquired, CellError> {
@@ -291,10 +304,12 @@ pub(super) fn acquire(
     let probes = instruments.probes.iter().map(identity).collect();
     let began = Instant::now();
     let profilers = std::mem::take(&mut instruments.profilers);
+    let mut feeding = Feeding::new(cell, part, (&profilers, &touches), watch);
     let (scan, profilers) = match &mut instruments.carrier {
-        Some(carrier) => scan_carried(profilers, carrier, watch)?,
-        None => scan(profilers, cell.plan, watch)?,
+        Some(carrier) => scan_carried(profilers, carrier, &mut feeding)?,
+        None => scan(profilers, cell.plan, &mut feeding)?,
     };
+    let meanwhile = feeding.end();
     let ended = Instant::now();
     instruments.profilers = profilers;
     Ok(Acquired {
@@ -303,30 +318,35 @@ pub(super) fn acquire(
         probes,
         scan_seconds: (ended - began).as_secs_f64(),
         ended,
+        part: part.clone(),
+        meanwhile,
     })
 }
 
-/// Finds the pose, measures and judges what was acquired. `now` tells whether calibrations still hold.
-pub(super) fn conclude(
-    cell: &Cell,
-    part: &Arc<Part>,
-    acquired: Acquired,
-    now: SystemTime,
-) -> Outcome {
-    let start = Start::Rough(cell.machine_from_part.inverse());
-    let request = Request {
-        touches: &acquired.touches,
-        ..Request::new(&part.recipe, start)
-    };
-    let mut inspection = inspect::inspect(&acquired.scan.cloud, &part.nominal, &request);
+/// Finds the pose, measures and judges what was acquired, or ends what went on meanwhile. `now` tells whether calibrations still hold.
+pub(super) fn conclude(cell: &Cell, mut acquired: Acquired, now: SystemTime) -> Outcome {
+    let part = acquired.part.clone();
+    let cloud = &acquired.scan.cloud;
+    let meanwhile = acquired.meanwhile.take();
+    let mut inspection = meanwhile
+        .and_then(|meanwhile| meanwhile.finish(cloud.len()))
+        .unwrap_or_else(|| {
+            let start = Start::Rough(cell.machine_from_part.inverse());
+            let request = Request {
+                touches: &acquired.touches,
+                ..Request::new(&part.recipe, start)
+            };
+            inspect::inspect(cloud, &part.nominal, &request)
+        });
     judge_completeness(&acquired.scan, &mut inspection);
     judge_calibrations(cell, now, &mut inspection);
     Outcome {
         scan_seconds: acquired.scan_seconds,
         verdict_seconds: acquired.ended.elapsed().as_secs_f64(),
         scan: acquired.scan,
-        part: part.clone(),
+        part,
         probes: acquired.probes,
+        touches: acquired.touches,
         inspection,
     }
 }

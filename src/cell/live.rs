@@ -7,6 +7,8 @@ use glam::DVec3;
 use serde::Serialize;
 use utoipa::ToSchema;
 
+use crate::inspect::EdgeSoFar;
+
 /// Points kept for showing. When there are as many, every second one goes and from then on half as many come.
 const POINTS_KEPT: usize = 200_000;
 
@@ -27,6 +29,18 @@ struct Inner {
     stride: usize,
     skipped: usize,
     profiles: Vec<LiveProfile>,
+    edges: LiveEdges,
+}
+
+/// The edges of the part as they are measured so far: nothing is judged before the scan has ended.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, ToSchema)]
+pub struct LiveEdges {
+    /// The inspection.
+    pub inspection: i64,
+    /// How often they have been measured; 0 before the part's pose is found.
+    pub number: u64,
+    /// All of them; none where they are known already.
+    pub edges: Vec<EdgeSoFar>,
 }
 
 /// A part of the points.
@@ -71,7 +85,20 @@ impl Live {
             stride: 1,
             skipped: 0,
             profiles: devices.iter().map(profile).collect(),
+            edges: LiveEdges {
+                inspection: job,
+                ..LiveEdges::default()
+            },
         };
+    }
+
+    /// Takes the edges of inspection `job` as they are measured so far.
+    pub(super) fn measured(&self, job: i64, edges: Vec<EdgeSoFar>) {
+        let mut inner = self.lock();
+        if inner.job == job {
+            inner.edges.number += 1;
+            inner.edges.edges = edges;
+        }
     }
 
     /// Takes a profile of device `view` and the points made of it.
@@ -114,6 +141,19 @@ impl Live {
     /// The newest profile of every device.
     pub fn profiles(&self) -> Vec<LiveProfile> {
         self.lock().profiles.clone()
+    }
+
+    /// The edges as they are measured so far, where they are not those of `inspection` with the number `known`.
+    pub fn edges(&self, inspection: i64, known: u64) -> LiveEdges {
+        let inner = self.lock();
+        let now = &inner.edges;
+        if (now.inspection, now.number) == (inspection, known) {
+            return LiveEdges {
+                edges: Vec::new(),
+                ..*now
+            };
+        }
+        now.clone()
     }
 
     fn lock(&self) -> MutexGuard<'_, Inner> {

@@ -404,8 +404,9 @@ impl<'a, B: Body> Task<'a, B> {
         let mut pose = start;
         let some = self.scan.subset(FINE_POINTS);
         let along_mm = self.scan.spacing.along_mm;
-        let (gate, rim) =
-            self.gates(along_mm, |gate, rim| self.observe(&pose, &some, gate, rim).len());
+        let (gate, rim) = self.gates(along_mm, |gate, rim| {
+            self.observe(&pose, &some, gate, rim).len()
+        });
         for _ in 0..12 {
             let step = self.solve(&self.observe(&pose, &some, gate, rim))?;
             pose = self.moved(&step.twist, pose);
@@ -726,8 +727,8 @@ impl<'a, B: Body> Task<'a, B> {
             )
         };
         // Faces shift, and patches bend and tilt them: the first moves the part, the second turns it.
-        let faces = form_by(|o, _| u64::from(o.face));
-        let patches = form_by(patch_of);
+        let (faces, patches) =
+            rayon::join(|| form_by(|o, _| u64::from(o.face)), || form_by(patch_of));
         let mut scaled = inverse * self.white_variance(observations, step) + faces + patches;
         for weak in &step.weak {
             scaled += weak * weak.transpose() * self.size_mm.powi(2);

@@ -170,8 +170,7 @@ pub(super) fn attended(
         .enumerate()
         .filter_map(|(i, p)| {
             let cell = outline.grid.cell(*p);
-            see.contains(&cell)
-                .then(|| (i, look.contains(&cell)))
+            see.contains(&cell).then(|| (i, look.contains(&cell)))
         })
         .collect();
     let (seen, counts) = found.into_iter().unzip();
@@ -260,10 +259,7 @@ impl Moments {
         let flat = |p: DVec3| DVec2::new(p.dot(u), p.dot(v));
         let mean = flat(self.place / n);
         let second = [u, v].map(|axis| flat(self.places * axis));
-        let spread = DMat2::from_cols(
-            second[0] - n * mean * mean.x,
-            second[1] - n * mean * mean.y,
-        );
+        let spread = DMat2::from_cols(second[0] - n * mean * mean.x, second[1] - n * mean * mean.y);
         let by_place = flat(self.by_place) - mean * self.deviation;
         let squares = self.squares - self.deviation * self.deviation / n;
         // A patch that is a mere line along a border slopes along it only.

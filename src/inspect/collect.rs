@@ -145,6 +145,12 @@ pub(super) struct Layer<'a> {
     pub(super) places: &'a [Place],
 }
 
+impl Sight {
+    pub(super) fn edge(&self) -> usize {
+        self.edge as usize
+    }
+}
+
 impl<'a> Layer<'a> {
     pub(super) fn new(cloud: &'a PointCloud, places: &'a [Place]) -> Self {
         Self {

@@ -144,6 +144,11 @@ impl<'a, B: Body> Growing<'a, B> {
         self.points == 0
     }
 
+    /// Whether the pose of the part has been found, so that edges can be measured.
+    pub fn is_placed(&self) -> bool {
+        self.base.is_some()
+    }
+
     /// Takes the points of consecutive profiles of one view, some ten thousand at a time, with the lattice; all pieces name the same views.
     pub fn push(&mut self, piece: PointCloud) {
         if piece.is_empty() {
@@ -240,7 +245,13 @@ impl<'a, B: Body> Growing<'a, B> {
             trials: None,
             estimate,
         };
-        judge_all(self.nominal, &self.request, (edges, &self.resolved), taken, stages)
+        judge_all(
+            self.nominal,
+            &self.request,
+            (edges, &self.resolved),
+            taken,
+            stages,
+        )
     }
 
     /// As if all points had come at once: for scans of which the pieces say too little.
@@ -258,9 +269,28 @@ impl<'a, B: Body> Growing<'a, B> {
         super::inspect(&all, self.nominal, &self.request)
     }
 
+    fn sketch_cell_mm(&self) -> f64 {
+        self.surface.size_mm() / SKETCH
+    }
+
+    /// The sketch as a scan of its own, spaced as its cells are.
+    fn sketch_scan<'s>(&'s self, neighbors: &'s Neighbors, noise_mm: f64) -> Scan<'s> {
+        let cell_mm = self.sketch_cell_mm();
+        Scan {
+            cloud: &self.sketch,
+            neighbors,
+            spacing: Spacing {
+                along_mm: cell_mm,
+                across_mm: cell_mm,
+                mean_mm: cell_mm,
+            },
+            noise_mm,
+        }
+    }
+
     /// Adds to the sketch one point of every cell that has none.
     fn draw(&mut self, piece: &PointCloud) {
-        let cell_mm = self.surface.size_mm() / SKETCH;
+        let cell_mm = self.sketch_cell_mm();
         if self.sketch.views.is_empty() {
             self.sketch.views.clone_from(&piece.views);
         }
@@ -281,11 +311,15 @@ impl<'a, B: Body> Growing<'a, B> {
             return;
         }
         let neighbors = Neighbors::new(&self.sketch.positions);
-        let scan = sketch_scan(&self.sketch, &neighbors, noise_mm);
+        let scan = self.sketch_scan(&neighbors, noise_mm);
         let options = self.datums.options(&self.request);
         let (aligned, candidates) =
             align_keeping(&scan, &self.surface, self.request.start, &options);
-        self.set_base(aligned.alignment.part_from_machine, (spacing, noise_mm), candidates);
+        self.set_base(
+            aligned.alignment.part_from_machine,
+            (spacing, noise_mm),
+            candidates,
+        );
     }
 
     fn set_base(&mut self, pose: RigidTransform, known: (Spacing, f64), candidates: Candidates) {
@@ -360,7 +394,7 @@ impl<'a, B: Body> Growing<'a, B> {
     fn aligned(&self) -> Option<Aligned> {
         let base = self.base.as_ref()?;
         let neighbors = Neighbors::new(&self.sketch.positions);
-        let scan = sketch_scan(&self.sketch, &neighbors, base.noise_mm);
+        let scan = self.sketch_scan(&neighbors, base.noise_mm);
         let step = self.points.div_ceil(POSE_POINTS).max(1);
         let laid = |piece: &Piece| {
             (0..piece.places.len())
@@ -394,7 +428,10 @@ impl<'a, B: Body> Growing<'a, B> {
         if moved <= SMALL_MOTION * base.noise_mm {
             return motion;
         }
-        tracing::debug!(moved_mm = moved, "the pose has moved too far: all points are laid again");
+        tracing::debug!(
+            moved_mm = moved,
+            "the pose has moved too far: all points are laid again"
+        );
         let known = (base.spacing, base.noise_mm);
         self.set_base(pose, known, Vec::new());
         RigidTransform::IDENTITY
@@ -412,17 +449,10 @@ impl<'a, B: Body> Growing<'a, B> {
         let own = *base.measuring.settings();
         let (motion, settings) = end.unwrap_or((&RigidTransform::IDENTITY, &own));
         let centre = motion.point(centre(&layers));
-        Some(base.measuring.combined(&self.breaks, motion, settings, centre))
-    }
-}
-
-/// The sketch as a scan of its own: its spacing is that of its cells.
-fn sketch_scan<'s>(sketch: &'s PointCloud, neighbors: &'s Neighbors, noise_mm: f64) -> Scan<'s> {
-    Scan {
-        cloud: sketch,
-        neighbors,
-        spacing: crate::points::spacing(sketch, neighbors),
-        noise_mm,
+        Some(
+            base.measuring
+                .combined(&self.breaks, motion, settings, centre),
+        )
     }
 }
 

@@ -2,7 +2,6 @@
 
 use std::ops::Range;
 
-
 use super::assign::{Place, Surface};
 use super::body::{Body, BodyEdge};
 use super::contributions::{Response, Shared};
@@ -155,7 +154,10 @@ impl<B: Body> EdgeContext<'_, B> {
             }
         }
         MeasuredEdge {
-            breaks: breaks.iter().map(|(_, found)| found.shape.clone()).collect(),
+            breaks: breaks
+                .iter()
+                .map(|(_, found)| found.shape.clone())
+                .collect(),
             flank_model: [series[0].model, series[1].model],
             stations,
             mean: self.mean(&sum, series),

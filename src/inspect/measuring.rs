@@ -28,8 +28,17 @@ const DEPTH: f64 = 3.0;
 /// Scan lines that a station must hold: three hold a slope, one more to see its noise.
 const LINES: f64 = 4.0;
 
+/// Names of choices of points: within the reach, within the most that it may grow to, and others by a number with this bit set. Of the
+/// others only the last one is kept.
+const NARROW: u64 = 0;
+const WIDE: u64 = 1;
+pub(super) const OTHER: u64 = 1 << 63;
+
 /// The shapes of an edge's stretches: by the first station, what they were found from and what was found.
 type Shapes = HashMap<usize, (u64, Option<Found>), FixedState>;
+
+/// The flanks of an edge by the choice of its points: number of points seen, how far, and what was measured.
+type Kept = HashMap<u64, ((usize, u64), [FlankSeries; 2]), FixedState>;
 
 /// The shapes found along an edge, each with its stations.
 pub(super) type Breaks = Vec<(Range<usize>, Found)>;
@@ -46,6 +55,9 @@ pub(super) struct Measuring<'a, B: Body> {
     room_mm: Vec<f64>,
     /// By layer.
     sights: Vec<Vec<Sight>>,
+    /// Points seen, by edge.
+    counts: Vec<usize>,
+    kept: Vec<Kept>,
     memos: Vec<[Memo; 2]>,
     shapes: Vec<Shapes>,
     series: Vec<[FlankSeries; 2]>,
@@ -81,6 +93,8 @@ impl<'a, B: Body> Measuring<'a, B> {
             tracks: Tracks::new(body, &edges, &windows),
             room_mm: flanks.iter().map(|s| s.reach_mm).collect(),
             sights: Vec::new(),
+            counts: vec![0; edges.len()],
+            kept: vec![Kept::default(); edges.len()],
             memos: edges.iter().map(|_| Default::default()).collect(),
             shapes: vec![Shapes::default(); edges.len()],
             series: Vec::new(),
@@ -93,7 +107,11 @@ impl<'a, B: Body> Measuring<'a, B> {
 
     /// Takes one more layer.
     pub(super) fn add(&mut self, layer: &Layer<'_>) {
-        self.sights.push(layer.sights(&self.tracks, &self.room_mm));
+        let sights = layer.sights(&self.tracks, &self.room_mm);
+        for sight in &sights {
+            self.counts[sight.edge()] += 1;
+        }
+        self.sights.push(sights);
     }
 
     /// Sees at least as far as `radius_mm`.
@@ -105,10 +123,11 @@ impl<'a, B: Body> Measuring<'a, B> {
         for (room, radius) in self.room_mm.iter_mut().zip(radius_mm) {
             *room = room.max(*radius);
         }
-        self.sights = layers
-            .iter()
-            .map(|layer| layer.sights(&self.tracks, &self.room_mm))
-            .collect();
+        self.sights.clear();
+        self.counts.fill(0);
+        for layer in layers {
+            self.add(layer);
+        }
     }
 
     fn all_sights(&self) -> Vec<&[Sight]> {
@@ -134,7 +153,8 @@ impl<'a, B: Body> Measuring<'a, B> {
             .collect();
         let all: Vec<usize> = (0..settings.len()).collect();
         let reach: Vec<f64> = settings.iter().map(|s| s.reach_mm).collect();
-        let mut series = self.fit(&all, (&assumed, 0), &reach, &narrow);
+        let first = vec![NARROW; all.len()];
+        let mut series = self.fit((&all, &first), &assumed, &reach, &narrow);
         let wide: Vec<bool> = series
             .iter()
             .map(|pair| pair.iter().any(|s| s.too_wide))
@@ -142,7 +162,11 @@ impl<'a, B: Body> Measuring<'a, B> {
         let room: Vec<f64> = (0..settings.len())
             .map(|e| {
                 let s = &settings[e];
-                if wide[e] { s.reach_limit_mm } else { s.reach_mm }
+                if wide[e] {
+                    s.reach_limit_mm
+                } else {
+                    s.reach_mm
+                }
             })
             .collect();
         self.widen(layers, &room);
@@ -157,7 +181,8 @@ impl<'a, B: Body> Measuring<'a, B> {
             .copied()
             .filter(|e| wide[*e] && room[*e] > settings[*e].reach_mm)
             .collect();
-        let grown = self.fit(&grow, (&assumed, 1), &room, &ample);
+        let wider = vec![WIDE; grow.len()];
+        let grown = self.fit((&grow, &wider), &assumed, &room, &ample);
         for (e, pair) in grow.iter().zip(grown) {
             series[*e] = pair;
         }
@@ -176,47 +201,82 @@ impl<'a, B: Body> Measuring<'a, B> {
             .into_iter()
             .filter(|e| self.edges[*e].faces.iter().any(|f| disturbed[*f as usize]))
             .collect();
-        let choice = FixedState::default().hash_one(seen.as_flattened().iter().map(|c| c.to_bits()).collect::<Vec<_>>());
-        let measured = self.fit(&again, (&seen, choice), &room, &ample);
+        // Points are left out by the edges of the same faces only.
+        let beside = |e: usize, other: &BodyEdge| {
+            let faces = self.edges[e].faces;
+            other.faces.iter().any(|face| faces.contains(face))
+        };
+        let choices: Vec<u64> = again
+            .iter()
+            .map(|e| {
+                let cuts = self.edges.iter().zip(&seen);
+                let cuts = cuts.filter(|(other, _)| beside(*e, other));
+                let cuts: Vec<[u64; 2]> = cuts.map(|(_, c)| c.map(f64::to_bits)).collect();
+                FixedState::default().hash_one(cuts) | OTHER
+            })
+            .collect();
+        let measured = self.fit((&again, &choices), &seen, &room, &ample);
         for (e, pair) in again.iter().zip(measured) {
             series[*e] = pair;
         }
         self.series = series;
     }
 
-    /// The flanks of the edges `wanted`; `choice` names the choice of points that `cuts` make.
+    /// The flanks of the edges `wanted`; `choices` name the choice of points that `cuts` make for each.
     fn fit(
         &mut self,
-        wanted: &[usize],
-        (cuts, choice): (&[[f64; 2]], u64),
+        (wanted, choices): (&[usize], &[u64]),
+        cuts: &[[f64; 2]],
         radius_mm: &[f64],
         settings: &[FlankSettings],
     ) -> Vec<[FlankSeries; 2]> {
-        if wanted.is_empty() {
-            return Vec::new();
+        let state = |e: usize| (self.counts[e], radius_mm[e].to_bits());
+        let is_known = |(e, choice): (&usize, &u64)| {
+            let known = self.kept[*e].get(choice);
+            known.is_some_and(|(known, _)| *known == state(*e))
+        };
+        let (changed, chosen): (Vec<usize>, Vec<u64>) = wanted
+            .iter()
+            .zip(choices)
+            .filter(|named| !is_known(*named))
+            .unzip();
+        if !changed.is_empty() {
+            let points = collect::flanks(&self.all_sights(), &changed, cuts, radius_mm);
+            let windows = &self.windows;
+            let memos = self.memos.iter_mut().enumerate();
+            let memos: Vec<(usize, &mut [Memo; 2])> =
+                memos.filter(|(e, _)| changed.contains(e)).collect();
+            let measured: Vec<[FlankSeries; 2]> = memos
+                .into_par_iter()
+                .zip(points)
+                .zip(&chosen)
+                .map(|(((e, [first, second]), pair), choice)| {
+                    let measure = |memo: &mut Memo, i: usize| {
+                        memo.choose(*choice);
+                        measure_flank_again(&pair[i], &windows[e], &settings[e], memo)
+                    };
+                    let (a, b) = rayon::join(|| measure(first, 0), || measure(second, 1));
+                    [a, b]
+                })
+                .collect();
+            for ((e, choice), pair) in changed.iter().zip(chosen).zip(measured) {
+                let state = (self.counts[*e], radius_mm[*e].to_bits());
+                let kept = &mut self.kept[*e];
+                kept.retain(|other, _| *other == choice || (*other & OTHER) == 0);
+                kept.insert(choice, (state, pair));
+            }
         }
-        let points = collect::flanks(&self.all_sights(), wanted, cuts, radius_mm);
-        let windows = &self.windows;
-        let chosen = self.memos.iter_mut().enumerate();
-        let chosen: Vec<(usize, &mut [Memo; 2])> =
-            chosen.filter(|(e, _)| wanted.contains(e)).collect();
-        chosen
-            .into_par_iter()
-            .zip(points)
-            .map(|((e, memos), pair)| {
-                let [first, second] = memos;
-                let measure = |memo: &mut Memo, i: usize| {
-                    memo.choose(choice);
-                    measure_flank_again(&pair[i], &windows[e], &settings[e], memo)
-                };
-                let (a, b) = rayon::join(|| measure(first, 0), || measure(second, 1));
-                [a, b]
-            })
-            .collect()
+        let kept = |(e, choice): (&usize, &u64)| self.kept[*e].get(choice).map(|(_, p)| p.clone());
+        wanted.iter().zip(choices).filter_map(kept).collect()
     }
 
     /// What combines the flanks of edge `e` into values.
-    pub(super) fn context(&self, e: usize, settings: &MeasureSettings, centre: DVec3) -> EdgeContext<'_, B> {
+    pub(super) fn context(
+        &self,
+        e: usize,
+        settings: &MeasureSettings,
+        centre: DVec3,
+    ) -> EdgeContext<'_, B> {
         EdgeContext {
             body: self.body,
             index: e,
@@ -240,7 +300,11 @@ impl<'a, B: Body> Measuring<'a, B> {
             let off = fits().map(|f| f.offset_mm.abs()).fold(0.0, f64::max);
             let seen = pair.iter().all(|s| s.stations.iter().any(Result::is_ok));
             let reach = Stretch::reach_of(cut, spacing_mm);
-            if seen { reach + 2.0 * off.min(reach) } else { 0.0 }
+            if seen {
+                reach + 2.0 * off.min(reach)
+            } else {
+                0.0
+            }
         };
         let radius: Vec<f64> = self.series.iter().map(radius).collect();
         self.widen(layers, &radius);
@@ -249,7 +313,13 @@ impl<'a, B: Body> Measuring<'a, B> {
             .iter()
             .map(|w| STRETCH as f64 * w.step_mm)
             .collect();
-        collect::near(&self.all_sights(), &self.edges, &radius, &stretch, POINTS_MAX)
+        collect::near(
+            &self.all_sights(),
+            &self.edges,
+            &radius,
+            &stretch,
+            POINTS_MAX,
+        )
     }
 
     /// The points of every edge's transition zone.
@@ -381,9 +451,19 @@ fn name_of(stretch: &Stretch<'_>, near: &[Near]) -> u64 {
     for wedge in &stretch.wedges {
         wedge.s.to_bits().hash(&mut hasher);
         for fit in wedge.flanks {
-            let values = [fit.offset_mm, fit.tilt, fit.slope, fit.bend, fit.cut_mm, fit.sigma_mm];
+            let values = [
+                fit.offset_mm,
+                fit.tilt,
+                fit.slope,
+                fit.bend,
+                fit.cut_mm,
+                fit.sigma_mm,
+            ];
             values.map(f64::to_bits).hash(&mut hasher);
-            fit.covariance.as_flattened().iter().for_each(|c| c.to_bits().hash(&mut hasher));
+            fit.covariance
+                .as_flattened()
+                .iter()
+                .for_each(|c| c.to_bits().hash(&mut hasher));
         }
     }
     stretch.shared_factor.map(f64::to_bits).hash(&mut hasher);
@@ -419,7 +499,12 @@ pub(super) fn measured<B: Body>(
     measuring.add(&layers[0]);
     measuring.measure(&layers);
     let breaks = measuring.breaks(&layers);
-    measuring.combined(&breaks, &RigidTransform::IDENTITY, settings, centre(&layers))
+    measuring.combined(
+        &breaks,
+        &RigidTransform::IDENTITY,
+        settings,
+        centre(&layers),
+    )
 }
 
 /// Stations about as long as needed for [`WANTED_POINTS`] and [`LINES`], a whole number of them on the edge.
@@ -470,4 +555,3 @@ fn flank_settings(
         keep_designs: false,
     }
 }
-

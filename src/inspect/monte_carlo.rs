@@ -15,9 +15,9 @@ use rayon::prelude::*;
 
 use super::assign::{Place, Surface};
 use super::body::Body;
+use super::collect::Layer;
 use super::edge_break::draw_stretch;
 use super::flank::{Design, FlankFit};
-use super::collect::Layer;
 use super::measure::{EdgeContext, MeasureSettings, MeasuredEdge, across};
 use super::measuring::{Measuring, centre};
 use super::result::Measured;

@@ -150,6 +150,7 @@ pub struct History {
     /// Only inspections with a smaller number.
     pub before: Option<i64>,
     /// How many, at most 500; 50 where nothing is said.
+    #[param(value_type = Option<i64>, minimum = 0, maximum = 4_294_967_295_u32)]
     pub limit: Option<u32>,
     /// Only of this part.
     pub part_serial: Option<String>,

@@ -99,6 +99,7 @@ pub(super) fn routes() -> (Router<App>, String) {
         .routes(routes!(cell::devices))
         .routes(routes!(cell::live_points))
         .routes(routes!(cell::live_profiles))
+        .routes(routes!(cell::live_edges))
         .routes(routes!(cell::stop))
         .routes(routes!(cell::abort))
         .routes(routes!(cell::halt))

@@ -2,10 +2,10 @@
 
 use std::f64::consts::PI;
 
+use acies::geometry::RigidTransform;
 use acies::inspect::body::Body;
 use acies::inspect::quantity::Quantity;
 use acies::inspect::result::{Inspection, Verdict};
-use acies::geometry::RigidTransform;
 use acies::inspect::{Growing, Recipe, Request, Start, inspect};
 use acies::points::{Frame, PointCloud};
 use glam::{DMat3, DVec2, DVec3};

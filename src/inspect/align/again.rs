@@ -5,9 +5,7 @@ use rayon::prelude::*;
 
 use super::scene::Scene;
 use super::search::Pose;
-use super::{
-    AlignOptions, Aligned, Candidates, Observation, Scan, Start, Step, TOO_FEW, Task,
-};
+use super::{AlignOptions, Aligned, Candidates, Observation, Scan, Start, Step, TOO_FEW, Task};
 use crate::geometry::RigidTransform;
 use crate::inspect::assign::{Place, Surface};
 use crate::inspect::body::Body;

@@ -1,7 +1,8 @@
 //! What the pose may be off because the part is not as drawn: faces, and patches of them, that share a deviation.
 
-use std::collections::BTreeMap;
+use std::collections::HashMap;
 
+use foldhash::fast::FixedState;
 use nalgebra::{Matrix6, Vector6};
 
 use super::{Observation, Step};
@@ -32,13 +33,25 @@ pub(super) fn form(
     group: impl Fn(&Observation) -> u64,
     size_mm: f64,
 ) -> Matrix6<f64> {
-    // By group: weighted sum of rows, sum of weights, residuals.
-    let mut groups: BTreeMap<u64, (Vector6<f64>, f64, Vec<f64>)> = BTreeMap::new();
+    // By group, as they come: weighted sum of rows, sum of weights, residuals.
+    let mut groups: Vec<(Vector6<f64>, f64, Vec<f64>)> = Vec::new();
+    let mut index: HashMap<u64, usize, FixedState> = HashMap::default();
+    let mut last = None;
     for (o, w) in observations.iter().zip(&step.weights) {
         if o.u_mm > 0.0 {
             continue;
         }
-        let entry = groups.entry(group(o)).or_default();
+        let name = group(o);
+        // Neighbours along a scan line mostly belong together.
+        let at = match last {
+            Some((known, at)) if known == name => at,
+            _ => *index.entry(name).or_insert(groups.len()),
+        };
+        if at == groups.len() {
+            groups.push(Default::default());
+        }
+        last = Some((name, at));
+        let entry = &mut groups[at];
         entry.0 += *w * o.scaled_row(size_mm);
         entry.1 += w;
         entry.2.push(o.residual_mm);
@@ -46,7 +59,7 @@ pub(super) fn form(
     let total = observations.len() as f64;
     let (mut square, mut expected, mut freedom) = (0.0, 0.0, 0.0);
     let mut scatter = Matrix6::zeros();
-    for (rows, weight, residuals) in groups.values_mut() {
+    for (rows, weight, residuals) in &mut groups {
         scatter += *rows * rows.transpose();
         let count = residuals.len() as f64;
         // A handful of stray points is no face.

@@ -5,6 +5,8 @@ use std::collections::HashMap;
 
 use foldhash::fast::FixedState;
 
+use crate::inspect::measuring::OTHER;
+
 use super::{FlankGap, FlankPoints, FlankSettings, Range, WindowFit, Windows, fit_window};
 
 /// What makes a fit another one, beside its points: station, inner and outer end of the range, and the choice of points.
@@ -22,10 +24,19 @@ pub struct Memo {
     choice: u64,
 }
 
+fn is_of(key: &Key, choice: u64) -> bool {
+    key.3 == choice || key.3 & OTHER == 0
+}
+
 impl Memo {
-    /// From here on points are chosen otherwise: fits of another choice are not used.
-    pub fn choose(&mut self, choice: u64) {
+    /// From here on points are chosen otherwise: fits of another choice are not used, and dropped but for those of the named choices.
+    pub(in crate::inspect) fn choose(&mut self, choice: u64) {
         self.choice = choice;
+        if choice & OTHER != 0 {
+            self.three.retain(|key, _| is_of(key, choice));
+            self.four.retain(|key, _| is_of(key, choice));
+            self.five.retain(|key, _| is_of(key, choice));
+        }
     }
 
     /// As [`fit_window`], of the window of station `k`.

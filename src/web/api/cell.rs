@@ -13,7 +13,7 @@ use serde::Deserialize;
 use tokio_stream::wrappers::WatchStream;
 use utoipa::IntoParams;
 
-use crate::cell::{Command, DeviceStatus, LiveProfile, Snapshot};
+use crate::cell::{Command, DeviceStatus, LiveEdges, LiveProfile, Snapshot};
 use crate::web::access::Who;
 use crate::web::app::{App, blocking};
 use crate::web::problem::{Asked, Problem};
@@ -98,6 +98,27 @@ pub async fn live_points(State(app): State<App>, Asked(asked): Asked<From>) -> R
     responses((status = 200, description = "thinned to what a picture shows", body = Vec<LiveProfile>)))]
 pub async fn live_profiles(State(app): State<App>) -> Json<Vec<LiveProfile>> {
     Json(app.handle().live().profiles())
+}
+
+/// Which of the live edges are there already.
+#[derive(Debug, Default, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+#[serde(default)]
+pub struct Known {
+    /// The inspection of the last answer.
+    inspection: i64,
+    /// Its number.
+    number: u64,
+}
+
+/// The edges of the part that is being scanned, or was scanned last, as they are measured so far. Nothing is judged before the end.
+///
+/// Where they are those that are there already, none come.
+#[utoipa::path(get, path = "/api/v1/live/edges", tag = "cell", params(Known),
+    responses((status = 200, description = "the edges, if they have been measured since", body = LiveEdges)))]
+pub async fn live_edges(State(app): State<App>, Asked(known): Asked<Known>) -> Json<LiveEdges> {
+    let live = app.handle().live();
+    Json(live.edges(known.inspection, known.number))
 }
 
 /// End regularly: the part under way is finished, those that wait are not begun.

@@ -33,6 +33,7 @@ pub async fn characteristics(State(app): State<App>) -> Result<Json<Vec<String>>
 #[serde(default)]
 pub struct TrendOf {
     /// The last so many, at most 500; 100 where nothing is said.
+    #[param(value_type = Option<i64>, minimum = 0, maximum = 4_294_967_295_u32)]
     limit: Option<u32>,
     /// Also of setup, audit and master parts and of simulated instruments.
     everything: bool,

@@ -22,6 +22,7 @@ pub struct Listed {
     /// Only entries with a smaller number.
     before: Option<i64>,
     /// How many, at most 500; 50 where nothing is said.
+    #[param(value_type = Option<i64>, minimum = 0, maximum = 4_294_967_295_u32)]
     limit: Option<u32>,
 }
 

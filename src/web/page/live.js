@@ -18,13 +18,16 @@ export function livePictures() {
     h("figure", {}, profile, h("figcaption", {}, t("live.profile"))),
     h("figure", {}, cloud, h("figcaption", {}, t("live.points"), " ", amount)));
   const points = new Points(cloud);
+  const edges = edgesSoFar();
+  element.append(edges.element);
   let timer = 0;
   let ended = false;
   // Nothing yet: the first look shows the scan that ran last.
   let running = null;
   const look = async () => {
     try {
-      const [profiles] = await Promise.all([get("/live/profiles"), points.fetch()]);
+      const [profiles, stations] = await Promise.all([get("/live/profiles"), edges.fetch(), points.fetch()]);
+      points.stations = stations;
       drawProfiles(profile, profiles);
       points.draw();
       amount.textContent = t("live.amount", { count: points.shown.toLocaleString(document.documentElement.lang) });
@@ -43,6 +46,37 @@ export function livePictures() {
     end() {
       ended = true;
       clearTimeout(timer);
+    },
+  };
+}
+
+/** The edges as they are measured so far, those farthest off first; `fetch()` gives the places of their stations. */
+function edgesSoFar() {
+  const rows = h("tbody");
+  const head = ["edge", "coverage", "mean", "worst"].map((key) => h("th", { scope: "col" }, t(`live.${key}`)));
+  const element = h("table.edges", { id: "live-edges", hidden: true },
+    h("caption", {}, t("live.edges")), h("thead", {}, h("tr", {}, ...head)), rows);
+  let known = { inspection: 0, number: 0 };
+  let stations = [];
+  const digits = (value) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: 3, maximumFractionDigits: 3 });
+  const share = (value) => value.toLocaleString(document.documentElement.lang, { style: "percent" });
+  const row = (edge) => h("tr", {},
+    h("th", { scope: "row" }, edge.id),
+    h("td.number", {}, share(edge.coverage)),
+    h("td.number", {}, edge.mean_d_mm ? edge.mean_d_mm.map(digits).join(" / ") : "–"),
+    h("td.number", {}, edge.worst_d_mm === null || edge.worst_d_mm === undefined ? "–" : digits(edge.worst_d_mm)));
+  return {
+    element,
+    async fetch() {
+      const now = await get(`/live/edges?inspection=${known.inspection}&number=${known.number}`);
+      if (now.inspection === known.inspection && now.number === known.number) return stations;
+      known = now;
+      const seen = now.edges.filter((edge) => edge.coverage > 0);
+      seen.sort((a, b) => Math.abs(b.worst_d_mm) - Math.abs(a.worst_d_mm));
+      rows.replaceChildren(...seen.map(row));
+      element.hidden = seen.length === 0;
+      stations = seen.flatMap((edge) => edge.stations);
+      return stations;
     },
   };
 }
@@ -165,6 +199,15 @@ class Points {
       }
     }
     context.putImageData(image, 0, 0);
+    // The measured stations lie over the points: an edge is seen where it is thin.
+    context.fillStyle = colour("--accent");
+    for (const [sx, sy, sz] of this.stations ?? []) {
+      const [x, y, z] = [sx - middle[0], sy - middle[1], sz - middle[2]];
+      const along = x * sine + y * cosine;
+      const px = width / 2 + (x * cosine - y * sine) * zoom;
+      const py = height / 2 - (along * rise + z * flat) * zoom;
+      context.fillRect(px - 1.5 * scale, py - 1.5 * scale, 3 * scale, 3 * scale);
+    }
   }
 }
 
