@@ -14,10 +14,14 @@ use crate::points::{Origin, PointCloud};
 /// Points that one task looks at.
 const BLOCK: usize = 8192;
 
+/// Departure from a line, over the length, below which an edge is straight: rounding.
+const STRAIGHT: f64 = 1e-10;
+
 /// An edge with frames along it, close enough together that the nearest one gives the coordinates of a point.
 pub(super) struct Track {
     frames: Vec<Station>,
-    tree: Neighbors,
+    /// Finds the nearest frame; none along a straight edge, where a projection does.
+    tree: Option<Neighbors>,
     half_step_mm: f64,
     low: DVec3,
     high: DVec3,
@@ -41,8 +45,12 @@ impl Track {
             .collect();
         let points: Vec<DVec3> = frames.iter().map(|f| f.point).collect();
         let fold = |pick: fn(DVec3, DVec3) -> DVec3| points.iter().copied().reduce(pick);
+        let straight = frames.iter().all(|f| {
+            let expected = frames[0].point + (f.s_mm - frames[0].s_mm) * frames[0].tangent;
+            f.point.distance(expected) <= STRAIGHT * edge.length_mm
+        });
         Self {
-            tree: Neighbors::new(&points),
+            tree: (!straight).then(|| Neighbors::new(&points)),
             half_step_mm: 0.5 * step,
             low: fold(DVec3::min).unwrap_or(DVec3::ZERO),
             high: fold(DVec3::max).unwrap_or(DVec3::ZERO),
@@ -62,9 +70,7 @@ impl Track {
         if beyond.length_squared() > (radius_mm + self.half_step_mm).powi(2) {
             return None;
         }
-        self.tree.nearest(p, 1, found);
-        let (index, _) = *found.first()?;
-        let frame = &self.frames[index as usize];
+        let frame = self.nearest(p, found)?;
         let offset = p - frame.point;
         let along = offset.dot(frame.tangent);
         let inside = along.clamp(-self.half_step_mm, self.half_step_mm);
@@ -77,15 +83,22 @@ impl Track {
 
     /// Distances of `p` from the edge into the two faces.
     fn depths(&self, p: DVec3) -> [f64; 2] {
-        let mut found = Vec::new();
-        self.tree.nearest(p, 1, &mut found);
-        match found.first() {
-            Some((index, _)) => {
-                let frame = &self.frames[*index as usize];
-                frame.into_face.map(|b| (p - frame.point).dot(b))
-            }
+        match self.nearest(p, &mut Vec::new()) {
+            Some(frame) => frame.into_face.map(|b| (p - frame.point).dot(b)),
             None => [0.0; 2],
         }
+    }
+
+    /// The frame nearest to `p`; `found` is scratch.
+    fn nearest(&self, p: DVec3, found: &mut Vec<(u32, f64)>) -> Option<&Station> {
+        let Some(tree) = &self.tree else {
+            let first = self.frames.first()?;
+            let along = (p - first.point).dot(first.tangent) / (2.0 * self.half_step_mm);
+            let last = (self.frames.len() - 1) as f64;
+            return self.frames.get(along.round().clamp(0.0, last) as usize);
+        };
+        tree.nearest(p, 1, found);
+        self.frames.get(found.first()?.0 as usize)
     }
 
     /// Whether arc length `s` lies between the ends of the edge, a rounding error apart.

@@ -12,7 +12,7 @@ use glam::{DMat3, IVec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::align::{Aligned, Candidates, LaidPoint, Scan, align_again, align_keeping};
+use super::align::{Aligned, Candidates, Conclusion, LaidPoint, Scan, align_again, align_keeping};
 use super::assign::{Place, Surface, towards};
 use super::attention::{Outline, Patches};
 use super::body::Body;
@@ -201,8 +201,13 @@ impl<'a, B: Body> Growing<'a, B> {
         let Aligned {
             mut alignment,
             findings: of_alignment,
+            conclusion,
             ..
         } = aligned;
+        // What a part of the scan suggested may be another pose than what all of it would.
+        if !matches!(conclusion, Conclusion::Good | Conclusion::AsGiven) {
+            return self.all_at_once();
+        }
         if self.datums.unknown {
             alignment.status = Verdict::NotDecidable;
         }
