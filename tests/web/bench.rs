@@ -14,7 +14,10 @@ use acies::config::{Cell, Service};
 use acies::store::{Phase, Role, SessionKind, Store};
 use acies::web;
 use acies_drivers::link::cable::Cable;
-use acies_simulators::demo_cell::{DemoCell, DemoOptions, RunningCell};
+use acies_simulators::demo_cell::{DemoCell, DemoOptions};
+use acies_simulators::grbl::SimulatedProbe;
+use acies_simulators::open_profile::SimulatedProfiler;
+use acies_simulators::wire::Wire;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
 
@@ -30,7 +33,7 @@ pub struct Served {
     pub store: Arc<Store>,
     service: Service,
     running: Option<Running>,
-    _devices: Option<RunningCell>,
+    _devices: Option<Devices>,
 }
 
 struct Running {
@@ -111,14 +114,7 @@ impl Served {
                 .replace("encoder_step = 200\n", "encoder_step = 500\n");
             fs::write(folder.join(file), text).expect("a copy of them");
         }
-        let playing = devices.then(|| {
-            let options = DemoOptions {
-                paced: true,
-                ..DemoOptions::new(1)
-            };
-            let cell = DemoCell::with_options(options);
-            cell.start(&folder.join("dev")).expect("pseudo-terminals")
-        });
+        let playing = devices.then(|| play(&folder));
         let mut service = read(&folder).service;
         service.simulated = true;
         change(&mut service);
@@ -323,4 +319,29 @@ pub fn measured() -> &'static Served {
         }
         panic!("three times a device was lost");
     })
+}
+
+/// The cell's devices, playing.
+type Devices = ([SimulatedProfiler; 2], SimulatedProbe);
+
+/// Plays the devices: the profilers in real time, so that there is something to watch, over sockets, which a busy machine serves better
+/// than pseudo-terminals; the probe as fast as it can, since its moves would take half a minute a part.
+fn play(folder: &Path) -> Devices {
+    let mut demo = DemoCell::with_options(DemoOptions {
+        paced: true,
+        ..DemoOptions::new(1)
+    });
+    let path = folder.join("cell.toml");
+    let mut text = fs::read_to_string(&path).expect("the cell");
+    let mut profiler = |which: usize, port: &str| {
+        let wire = Wire::tcp(SocketAddr::from(([127, 0, 0, 1], 0))).expect("a port");
+        let address = format!("address = {:?}", wire.name());
+        text = text.replace(&format!("port = \"./dev/{port}\""), &address);
+        demo.start_profiler(which, wire).expect("a profiler")
+    };
+    let profilers = [profiler(0, "ttyLEFT"), profiler(1, "ttyRIGHT")];
+    fs::write(&path, text).expect("the cell");
+    demo.options.paced = false;
+    let wire = Wire::pty(&folder.join("dev/ttyPROBE")).expect("a pseudo-terminal");
+    (profilers, demo.start_probe(wire).expect("the probe"))
 }
