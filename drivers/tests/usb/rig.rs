@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 
 use acies_drivers::error::LinkError;
 use acies_drivers::link::cable::Cable;
-use acies_drivers::link::usb::{Request, UsbInterface, UsbLink, UsbTarget, interfaces};
+use acies_drivers::link::usb::{
+    OneByOne, Request, UsbInterface, UsbLink, UsbStream, UsbTarget, interfaces,
+};
 use acies_drivers::link::{Link, Links, Target};
 use acies_simulators::u3v::{self, Profiler};
 use acies_simulators::usb::preload::Carrier;
@@ -89,6 +91,13 @@ impl Plug {
         }
     }
 
+    /// Makes a gauge another one of its kind.
+    fn change(&self) {
+        if let Plug::Itn(socket) = self {
+            socket.with(|tool| tool.serial = "ANOTHER".into());
+        }
+    }
+
     fn press(&self) {
         if let Plug::Itn(socket) = self {
             socket.with(InputTool::press);
@@ -121,6 +130,8 @@ impl Rig for InProcess {
         match (order, plug) {
             ("truth", plug) => return plug.truth(),
             ("press", plug) => plug.press(),
+            ("another", plug) => plug.change(),
+            (order, _) if order.starts_with("memory") => return "no system".into(),
             ("unplug", Plug::U3v(socket)) => socket.unplug(),
             ("unplug", Plug::Itn(socket)) => socket.unplug(),
             ("replug", Plug::U3v(socket)) => socket.replug(),
@@ -245,6 +256,15 @@ impl<M: Model> UsbLink for Called<M> {
         answered(self.socket.output(endpoint, bytes), &mut [])
     }
 
+    fn stream(
+        &self,
+        endpoint: u8,
+        _: usize,
+        bytes: usize,
+    ) -> Result<Box<dyn UsbStream + '_>, LinkError> {
+        Ok(Box::new(OneByOne::new(self, endpoint, bytes)))
+    }
+
     fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError> {
         self.socket.clear_halt(endpoint);
         Ok(())
@@ -360,6 +380,11 @@ impl OverLibusb {
         match (order, &self.carrier) {
             ("truth", _) => return self.plug.truth(),
             ("press", _) => self.plug.press(),
+            ("another", _) => self.plug.change(),
+            (order, AnyCarrier::U3v(carrier)) if order.starts_with("memory ") => {
+                let bytes = order["memory ".len()..].parse();
+                carrier.limit_memory(bytes.expect("a number"));
+            }
             ("unplug", AnyCarrier::U3v(carrier)) => carrier.unplug(),
             ("unplug", AnyCarrier::Itn(carrier)) => carrier.unplug(),
             ("replug", AnyCarrier::U3v(carrier)) => carrier.replug().expect("a tree"),
