@@ -3,7 +3,10 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use acies::acquire::{Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, scan_carried};
+use acies::acquire::lag::{Artefact, Lag, find_lag};
+use acies::acquire::{
+    Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, run_carried, scan_carried,
+};
 use acies::config::Cell;
 use acies::geometry::RigidTransform;
 use acies_drivers::capture::{Pose, Profile};
@@ -485,5 +488,219 @@ fn a_robot_that_is_lost_leaves_the_scan_incomplete_with_what_came_before() {
                 .ends_with("it is gone: closed or unplugged; plug it in again and reopen"),
         "{:?}",
         view.findings
+    );
+}
+
+// ---- The lag ----------------------------------------------------------------------------------------------------------
+
+/// To and fro over 120 mm in four seconds, at up to 94 mm/s, or only there; the tool looks down.
+fn to_and_fro(t: f64, back: bool) -> RigidTransform {
+    let end = if back { 4.0 } else { 2.0 };
+    let share = 0.5 - 0.5 * (std::f64::consts::PI * t.clamp(0.0, end) / 2.0).cos();
+    let down = DQuat::from_rotation_x(std::f64::consts::PI);
+    RigidTransform::new(down, DVec3::new(0.0, 120.0 * share, 300.0))
+}
+
+/// What a ray meets.
+#[derive(Clone, Copy)]
+enum Target {
+    Sphere(DVec3, f64),
+    /// A plane through a point.
+    Plane(DVec3, DVec3),
+}
+
+fn meets(target: Target, from: DVec3, along: DVec3) -> f64 {
+    match target {
+        Target::Plane(point, normal) => (point - from).dot(normal) / along.dot(normal),
+        Target::Sphere(centre, radius) => {
+            let (to, half) = (centre - from, (centre - from).dot(along));
+            let inside = radius * radius - (to.length_squared() - half * half);
+            if inside < 0.0 {
+                return f64::NAN;
+            }
+            half - inside.sqrt()
+        }
+    }
+}
+
+/// Noise of 10 um, the same every time.
+fn noise_mm(k: usize) -> f64 {
+    let mixed = (k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (k as u64) << 17;
+    let uniform = (mixed.wrapping_mul(0xBF58_476D_1CE4_E5B9) >> 11) as f64 / (1_u64 << 53) as f64;
+    0.010 * 12_f64.sqrt() * (uniform - 0.5)
+}
+
+/// The lag that is found where profiles reach the host `late` after they are taken, and poses at once.
+fn lag_of(target: Target, artefact: Artefact, late: Duration, back: bool) -> Result<Lag, String> {
+    let began = Instant::now();
+    let base = RigidTransform::new(DQuat::IDENTITY, BASE);
+    let seconds = if back { 4.0 } else { 2.0 };
+    let poses = (0..(seconds / 0.004) as usize + 60).map(|k| {
+        let true_s = 0.004 * k as f64;
+        let pose = to_and_fro(true_s, back);
+        Pose {
+            device_time_s: ROBOT.at(true_s),
+            position_mm: pose.translation.into(),
+            rotation: pose.rotation.to_scaled_axis().into(),
+            host_time: began + Duration::from_secs_f64(true_s) + delay(k),
+        }
+    });
+    let profiles = (0..(seconds / 0.01) as usize - 20).map(|k| {
+        let true_s = 0.1 + 0.01 * k as f64;
+        let machine_from_sensor = base * to_and_fro(true_s, back) * tool_from_sensor();
+        let along = machine_from_sensor.vector(DVec3::Z);
+        let x_mm: Vec<f64> = (-20..=20).map(f64::from).collect();
+        let z = |(i, x): (usize, &f64)| {
+            let from = machine_from_sensor.point(DVec3::X * *x);
+            meets(target, from, along) + noise_mm(41 * k + i)
+        };
+        Profile {
+            sequence: k as u32,
+            boot: 0,
+            device_time_ns: (SENSOR.at(true_s) * 1e9).round() as u64,
+            encoder: None,
+            host_time: began + Duration::from_secs_f64(true_s) + delay(k + 3) + late,
+            dropped: 0,
+            saturated: false,
+            z_mm: x_mm.iter().enumerate().map(z).collect(),
+            x_mm,
+            intensity: Vec::new(),
+        }
+    });
+    let mut profilers = [Profiling {
+        name: "line".into(),
+        profiler: Box::new(Scripted::new(profiles.collect(), 0)),
+        calibration: Calibration {
+            machine_from_sensor: tool_from_sensor(),
+            travel_mm_per_count: DVec3::ZERO,
+        },
+    }];
+    let mut carrier = Carrier {
+        name: "arm".into(),
+        robot: Box::new(Scripted::new(poses.collect::<Vec<Pose>>(), 0)),
+        plan: CarrierPlan {
+            end_mm: to_and_fro(seconds, back).translation,
+            ..plan()
+        },
+    };
+    let run = run_carried(&mut profilers, &mut carrier, &mut |_: ScanEvent| {}).expect("a run");
+    assert_eq!(run.broken(&profilers, &carrier), None);
+    let pass = run.pass(0, &profilers[0], &carrier).expect("clocks");
+    find_lag(&[pass], artefact).map_err(|error| error.to_string())
+}
+
+#[test]
+fn the_lag_of_late_profiles_is_found_over_a_sphere_and_an_inclined_plate() {
+    // Below the path's middle, seen from all sides of its cap; the plate leans along the path.
+    let sphere = Target::Sphere(BASE + DVec3::new(0.0, 60.0, 40.0), 15.0);
+    let lean = DVec3::new(0.05, 0.4, 1.0).normalize();
+    let plate = Target::Plane(BASE + DVec3::new(0.0, 60.0, 40.0), lean);
+    let of_15_mm = Artefact::Sphere { radius_mm: 14.5 };
+    for late_us in [0, 700, 8_000, 45_000] {
+        for (target, artefact) in [(sphere, of_15_mm), (plate, Artefact::Plate)] {
+            let late = Duration::from_micros(late_us);
+            let lag = lag_of(target, artefact, late, true).expect("a lag");
+            let error_s = lag.lag_s + late.as_secs_f64();
+            // Beside the noise: the chord between poses of 4 ms, a t^2 / 8 = 0.3 um at 148 mm/s^2, over 50 mm/s and more.
+            let allowed_s = 3.0 * lag.u_s + 6e-6;
+            assert!(
+                error_s.abs() < allowed_s,
+                "{late_us} us, {artefact:?}: {lag:?}"
+            );
+            assert!(lag.u_s < 2e-5 && lag.rms_mm < 0.012, "{lag:?}");
+        }
+    }
+}
+
+#[test]
+fn a_lag_that_nothing_shows_is_said_to_be_open() {
+    let sphere = Target::Sphere(BASE + DVec3::new(0.0, 60.0, 40.0), 15.0);
+    let level = Target::Plane(BASE + DVec3::new(0.0, 60.0, 40.0), DVec3::Z);
+    let cases = [
+        (sphere, Artefact::Sphere { radius_mm: 15.0 }, false),
+        (level, Artefact::Plate, true),
+    ];
+    for (target, artefact, back) in cases {
+        let told = lag_of(target, artefact, Duration::ZERO, back).expect_err("nothing shows it");
+        assert!(told.starts_with("the lag stays open"), "{told}");
+    }
+    let none = lag_of(
+        level,
+        Artefact::Sphere { radius_mm: 15.0 },
+        Duration::ZERO,
+        true,
+    );
+    let told = none.expect_err("no sphere");
+    assert!(told.contains("no sphere of radius 15 mm among"), "{told}");
+}
+
+/// A ball under a robot that goes to and fro every six seconds, and a sensor whose picture of it is 20 ms old.
+#[test]
+fn the_command_finds_the_lag_of_simulated_devices() {
+    const OLD_S: f64 = 0.020;
+    let path = |t: f64| {
+        // It rests until the program has opened the devices.
+        let within = (t - 4.0).max(0.0) % 6.0;
+        let down = pose::Pose::turn_about(DVec3::ZERO, DVec3::X, std::f64::consts::PI);
+        let there = eased(within / 2.0) - eased((within - 2.0) / 2.0);
+        pose::Pose::shift(DVec3::new(400.0, 100.0 + 100.0 * there, 300.0)).after(down)
+    };
+    let (tool, seen) = (
+        Arc::new(Motion::new(path)),
+        Arc::new(Motion::new(move |t| path(t - OLD_S))),
+    );
+    let mut surfaces = Surfaces::default();
+    let (ball, _) = surfaces.sphere("ball", DVec3::new(150.0, 150.0, 50.0), 20.0);
+    let view = View {
+        scene: Arc::new(Scene::new(surfaces, ball)),
+        ..view()
+    };
+    let mut robot = ur_rtde::Setup::new(Arc::clone(&tool), 9);
+    robot.go_after = None;
+    let wire = Wire::tcp("127.0.0.1:0".parse().expect("an address")).expect("a socket");
+    let robot = SimulatedRobot::start(wire, robot).expect("a robot");
+    let line = SimulatedGocator::start(gocator::Setup {
+        form: Form::PointCloud,
+        rate_hz: Some(200.0),
+        ..gocator::Setup::new(13_434, Surface::Carried(Box::new(view), Arc::clone(&seen)))
+    })
+    .expect("a sensor");
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("lag");
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+    let text =
+        std::fs::read_to_string(example.join("ur-rtde/cell.toml")).expect("the example cell");
+    let nominal = example.join("demo/part.step").display().to_string();
+    let text = text
+        .replace("../demo/part.step", &nominal)
+        .replace("192.168.1.30", robot.port())
+        .replace("address = \"192.168.1.10\"", &line.keys())
+        .replace(
+            "end_mm = [400.0, 250.0, 300.0]",
+            "end_mm = [400.0, 100.0, 300.0]",
+        );
+    let cell = folder.join("cell.toml");
+    std::fs::write(&cell, text).expect("a cell");
+    let now = Instant::now();
+    tool.go(now);
+    seen.go(now);
+    let run = std::process::Command::new(env!("CARGO_BIN_EXE_acies"))
+        .args(["calibrate", "--lag", "2", "--radius", "20", "--json"])
+        .arg(&cell)
+        .output()
+        .expect("the program");
+    let told = String::from_utf8_lossy(&run.stderr);
+    assert!(run.status.success(), "{told}");
+    assert!(
+        told.contains("pass 2 of 2: start the robot's program"),
+        "{told}"
+    );
+    let lag: serde_json::Value = serde_json::from_slice(&run.stdout).expect("JSON");
+    let (lag_s, u_s) = (lag["lag_s"].as_f64().unwrap(), lag["u_s"].as_f64().unwrap());
+    // What the two links' least delays may differ by.
+    assert!((lag_s + OLD_S).abs() < LEAST_DELAY_S, "{lag}");
+    assert!(
+        u_s < LEAST_DELAY_S && lag["passes"].as_array().unwrap().len() == 2,
+        "{lag}"
     );
 }

@@ -116,14 +116,17 @@ fn sustain(name: &str, profiler: &mut dyn Profiler) {
     profiler.start().expect("a start");
     let began = Instant::now();
     let (mut profiles, mut points) = (0_u64, 0_u64);
+    let mut late = Vec::new();
     while began.elapsed() < Duration::from_secs(seconds()) {
         let profile = profiler.next(Instant::now() + Duration::from_secs(10));
         let profile = profile.expect("a link").expect("a profile in time");
         profiles += 1;
+        late.push(profile.host_time.elapsed());
         points += profile.z_mm.len() as u64;
     }
     let elapsed = began.elapsed().as_secs_f64();
     let rest = profiler.stop().expect("a stop").len() as u64;
+    late.sort_unstable();
     let losses = profiler.losses();
     say(&format!(
         "{name}: {:.1} M points/s, {:.0} profiles/s of {COLUMNS} points, sustained for {elapsed:.0} s; lost {}, rejected {}, dropped {} of {}",
@@ -133,6 +136,11 @@ fn sustain(name: &str, profiler: &mut dyn Profiler) {
         losses.rejected,
         losses.dropped_by_device,
         profiles + rest,
+    ));
+    say(&format!(
+        "  from its last byte to the caller: median {:?}, worst {:?}",
+        late[late.len() / 2],
+        late[late.len() - 1]
     ));
     assert_eq!(
         losses.lost_on_link + losses.rejected + losses.dropped_by_device,

@@ -56,13 +56,13 @@ pub trait Rig {
 
 /// A socket of either device.
 #[derive(Clone)]
-enum Plug {
+pub enum Plug {
     U3v(Socket<Profiler>),
     Itn(Socket<InputTool>),
 }
 
 impl Plug {
-    fn new(device: Device) -> Plug {
+    pub fn new(device: Device) -> Plug {
         match device {
             Device::U3v(setup) => Plug::U3v(Socket::new(Profiler::new(*setup))),
             Device::Itn(tool) => Plug::Itn(Socket::new(tool)),
@@ -89,6 +89,31 @@ impl Plug {
                 socket.with(|tool| format!("raw={} asked={}", u8::from(tool.raw), tool.asked))
             }
         }
+    }
+
+    pub fn unplug(&self) {
+        match self {
+            Plug::U3v(socket) => socket.unplug(),
+            Plug::Itn(socket) => socket.unplug(),
+        }
+    }
+
+    pub fn replug(&self) {
+        match self {
+            Plug::U3v(socket) => socket.replug(),
+            Plug::Itn(socket) => socket.replug(),
+        }
+    }
+
+    /// Does what needs no carrier.
+    pub fn carry_out(&self, order: &str) -> String {
+        match order {
+            "truth" => return self.truth(),
+            "press" => self.press(),
+            "another" => self.change(),
+            _ => panic!("no order {order}"),
+        }
+        String::new()
     }
 
     /// Makes a gauge another one of its kind.
@@ -127,16 +152,11 @@ impl Rig for InProcess {
 
     fn order(&self, order: &str) -> String {
         let plug = &self.links.0;
-        match (order, plug) {
-            ("truth", plug) => return plug.truth(),
-            ("press", plug) => plug.press(),
-            ("another", plug) => plug.change(),
-            (order, _) if order.starts_with("memory") => return "no system".into(),
-            ("unplug", Plug::U3v(socket)) => socket.unplug(),
-            ("unplug", Plug::Itn(socket)) => socket.unplug(),
-            ("replug", Plug::U3v(socket)) => socket.replug(),
-            ("replug", Plug::Itn(socket)) => socket.replug(),
-            _ => panic!("no order {order}"),
+        match order {
+            "unplug" => plug.unplug(),
+            "replug" => plug.replug(),
+            order if order.starts_with("memory") => return "no system".into(),
+            order => return plug.carry_out(order),
         }
         String::new()
     }
@@ -275,7 +295,7 @@ impl<M: Model> UsbLink for Called<M> {
 
 const CASE: &str = "ACIES_USB_CASE";
 /// Begins a line with which the child asks for something.
-const ORDER: &str = "ORDER ";
+pub const ORDER: &str = "ORDER ";
 
 /// The case and variant that this process is the child of.
 pub fn child_of_a_case() -> Option<(String, usize)> {
@@ -378,9 +398,6 @@ impl OverLibusb {
 
     fn carry_out(&self, order: &str) -> String {
         match (order, &self.carrier) {
-            ("truth", _) => return self.plug.truth(),
-            ("press", _) => self.plug.press(),
-            ("another", _) => self.plug.change(),
             (order, AnyCarrier::U3v(carrier)) if order.starts_with("memory ") => {
                 let bytes = order["memory ".len()..].parse();
                 carrier.limit_memory(bytes.expect("a number"));
@@ -389,7 +406,7 @@ impl OverLibusb {
             ("unplug", AnyCarrier::Itn(carrier)) => carrier.unplug(),
             ("replug", AnyCarrier::U3v(carrier)) => carrier.replug().expect("a tree"),
             ("replug", AnyCarrier::Itn(carrier)) => carrier.replug().expect("a tree"),
-            _ => panic!("no order {order}"),
+            (order, _) => return self.plug.carry_out(order),
         }
         String::new()
     }
