@@ -7,13 +7,18 @@ use acies::acquire::lag::{Artefact, Lag, find_lag};
 use acies::acquire::{
     Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, run_carried, scan_carried,
 };
+use acies::cell::{Daemon, DaemonOptions, Mode, Snapshot, State};
 use acies::config::Cell;
 use acies::geometry::RigidTransform;
+use acies::report::Report;
+use acies::report::wire::Status;
+use acies::store::{Order, Phase, Store};
 use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::cable::Cable;
 use acies_simulators::carried::{Motion, eased};
+use acies_simulators::demo_cell::DemoCell;
 use acies_simulators::gocator::{Form, SimulatedGocator, Surface};
 use acies_simulators::pose;
 use acies_simulators::scene::{Scene, Solid, Surfaces};
@@ -703,4 +708,171 @@ fn the_command_finds_the_lag_of_simulated_devices() {
         u_s < LEAST_DELAY_S && lag["passes"].as_array().unwrap().len() == 2,
         "{lag}"
     );
+}
+
+// ---- A whole inspection -----------------------------------------------------------------------------------------------
+
+/// Of the robot over the part, mm/s: slow, so that what the links' delays differ by is little.
+const CAREFUL_MM_S: f64 = 20.0;
+
+/// The demo's part, its two sensors side by side on a robot's tool, and its probe: the cell, and the devices that must live.
+fn robot_cell(folder: &std::path::Path) -> (Cell, impl Sized) {
+    let demo = DemoCell::new(3);
+    let way = DVec3::Y * 100.0;
+    let motion = Arc::new(Motion::straight(pose::Pose::IDENTITY, way, CAREFUL_MM_S));
+    let wire = Wire::tcp("127.0.0.1:0".parse().expect("an address")).expect("a socket");
+    let robot = SimulatedRobot::start(wire, ur_rtde::Setup::new(Arc::clone(&motion), 9));
+    let robot = robot.expect("a robot");
+    let lines = [0, 1].map(|which| {
+        let view = Box::new(demo.sensors[which].view.clone());
+        SimulatedGocator::start(gocator::Setup {
+            form: Form::PointCloud,
+            rate_hz: Some(50.0),
+            ..gocator::Setup::new(
+                100 + which as u32,
+                Surface::Carried(view, Arc::clone(&motion)),
+            )
+        })
+        .expect("a sensor")
+    });
+    let port = folder.join("ttyPROBE");
+    let probe = demo
+        .start_probe(Wire::pty(&port).expect("a port"))
+        .expect("a probe");
+    let configs = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
+    for file in ["recipe.toml", "part.step"] {
+        std::fs::copy(configs.join(file), folder.join(file)).expect("the demo's file");
+    }
+    let text = std::fs::read_to_string(configs.join("cell.toml")).expect("the demo's cell");
+    let (head, _) = text
+        .split_once("# How the profilers move")
+        .expect("its stage");
+    let (_, tail) = text.split_once("name = \"probe\"").expect("its probe");
+    let tail = tail.replace("./dev/ttyPROBE", &port.display().to_string());
+    let frame = |at: pose::Pose| {
+        let pose::Pose {
+            rotation: r,
+            translation: t,
+        } = at;
+        format!(
+            "origin_mm = {:?}\nx_axis = {:?}\nz_axis = {:?}\n",
+            t.to_array(),
+            r.x_axis.to_array(),
+            r.z_axis.to_array()
+        )
+    };
+    let mut cell = format!(
+        "{head}[[device]]\nname = \"arm\"\ndriver = \"ur-rtde\"\naddress = \"{}\"\n[device.carrier]\nend_mm = {:?}\nwithin_mm = 0.5\n\
+         silence_s = 5.0\n[device.carrier.machine_from_base]\n{}",
+        robot.port(),
+        way.to_array(),
+        frame(pose::Pose::IDENTITY)
+    );
+    for (line, sensor) in lines.iter().zip(&demo.sensors) {
+        cell += &format!(
+            "[[device]]\nname = \"{}\"\ndriver = \"gocator\"\n{}\nfirst_frame = 0\n[device.calibration]\n{}",
+            sensor.name,
+            line.keys(),
+            frame(sensor.stated_machine_from_sensor)
+        );
+    }
+    cell += &format!("[[device]]\nname = \"probe\"{tail}");
+    let path = folder.join("cell.toml");
+    std::fs::write(&path, cell).expect("a cell");
+    let cell = Cell::read(&path).unwrap_or_else(|errors| panic!("{errors}"));
+    (cell, (robot, lines, probe))
+}
+
+#[test]
+fn a_part_under_a_robot_is_inspected_from_touch_to_verdict() {
+    let folder = std::env::temp_dir().join(format!("acies-carried-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let (cell, devices) = robot_cell(&folder);
+    let store = Arc::new(Store::open(&folder.join("store")).expect("a store"));
+    let options = DaemonOptions {
+        simulated: true,
+        ..DaemonOptions::default()
+    };
+    let daemon = Daemon::start(Arc::new(cell), store, Arc::new(Cable), options).expect("a daemon");
+    let handle = daemon.handle();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = runtime.expect("a runtime");
+    let until = |is_so: &dyn Fn(&Snapshot) -> bool| {
+        let mut follow = handle.follow();
+        let waited = runtime.block_on(async {
+            let wait = follow.wait_for(|snapshot| is_so(snapshot));
+            let limit = Duration::from_secs(300);
+            tokio::time::timeout(limit, wait)
+                .await
+                .map(|found| drop(found.expect("a daemon")))
+        });
+        assert!(waited.is_ok(), "never so: {:#?}", handle.snapshot());
+    };
+    until(&|snapshot| snapshot.state == State::Ready);
+    let order = Order {
+        part_serial: "R-1".into(),
+        ..Order::default()
+    };
+    let (asked, _) = runtime
+        .block_on(handle.start(order, "anna", None, Mode::Single))
+        .map_err(|(refusal, _)| refusal)
+        .expect("taken");
+    until(&|snapshot| {
+        let work = snapshot
+            .acquiring
+            .iter()
+            .chain(&snapshot.computing)
+            .chain(&snapshot.queue);
+        !work.into_iter().any(|job| job.id == asked.id)
+    });
+    let ended = handle
+        .store()
+        .inspection(asked.id)
+        .expect("it is in the history");
+    assert_eq!(ended.phase, Phase::Done, "{}", ended.reason);
+    let report: Report =
+        serde_json::from_str(&handle.store().report_json(asked.id).expect("a report"))
+            .expect("JSON");
+    // The defects that were made, found from a robot: the wall's offset of 60 um at both of its edges, a good edge where one was made.
+    assert_eq!(report.verdict, Status::NotOk, "{}", report.reason);
+    assert_eq!(report.alignment.status, Status::Ok, "{}", report.reason);
+    assert!(
+        report.missing_edges.is_empty(),
+        "{:?}",
+        report.missing_edges
+    );
+    let edge = |entity| {
+        let found = report
+            .edges
+            .iter()
+            .find(|edge| edge.nominal_entity == entity);
+        &found.expect("an edge of the part").summary
+    };
+    // What the two views' times differ by, at this speed; 5 um are the demo's own.
+    let allowed_mm = 0.005 + 0.5 * LEAST_DELAY_S * CAREFUL_MM_S;
+    let near = |found: Option<acies::report::wire::Spread>, made_mm: f64| {
+        let mean = found.expect("measured").mean;
+        assert!(
+            (mean - made_mm).abs() < allowed_mm,
+            "{mean} mm, made {made_mm} mm"
+        );
+    };
+    near(edge(237).d1_mm, 0.060);
+    near(edge(181).d2_mm, 0.060);
+    near(edge(237).d2_mm, 0.0);
+    near(edge(337).d1_mm, 0.0);
+    let names: Vec<&str> = report
+        .devices
+        .iter()
+        .map(|device| device.name.as_str())
+        .collect();
+    assert!(
+        names.contains(&"left") && names.contains(&"right"),
+        "{names:?}"
+    );
+    drop((handle, daemon, devices));
+    let _ = std::fs::remove_dir_all(&folder);
 }

@@ -486,8 +486,15 @@ fn the_laser_goes_off(rig: &dyn Rig, _: usize) {
     let mut profiler = open(rig, "");
     profiler.start().expect("a start");
     std::mem::forget(profiler);
-    let _again = open(rig, "");
-    assert_eq!(rig.number("laser"), 0, "after reopening");
+    match open_with(rig, "u3v-profiler", "") {
+        Ok(_again) => assert_eq!(rig.number("laser"), 0, "after reopening"),
+        // A real kernel knows that the program that has it open lives: it is this one.
+        Err(error) => assert!(
+            text(&error).ends_with("another program has it open; close that program, then retry"),
+            "{}",
+            text(&error)
+        ),
+    }
 }
 
 fn several_lines() -> Vec<Device> {
@@ -826,9 +833,11 @@ fn examples() -> Vec<Device> {
 /// The example cells under configs/: each opens its device.
 fn the_example_cells_open(rig: &dyn Rig, variant: usize) {
     let driver = ["u3v-profiler", "usb-itn"][variant];
-    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join(format!("../configs/{driver}/cell.toml"));
-    let read = std::fs::read_to_string(path).expect("an example cell");
+    // In the program itself: a virtual machine has no such files.
+    let read = [
+        include_str!("../../../configs/u3v-profiler/cell.toml"),
+        include_str!("../../../configs/usb-itn/cell.toml"),
+    ][variant];
     let cell: toml::Table = read.parse().expect("TOML");
     let devices = cell["device"].as_array().expect("devices");
     let device = devices
