@@ -151,7 +151,7 @@ fn all_at_once(each: impl Fn(Bench) + Sync) {
 #[test]
 fn each_says_whether_its_idle_device_is_there() {
     let cell = cell(1, "");
-    all_at_once(|bench| {
+    for bench in benches() {
         let (device, link) = bench.plug(&cell, "check");
         let setup = bench.setup(&link, "");
         let mut instrument = open(&*setup, &Cable);
@@ -169,7 +169,9 @@ fn each_says_whether_its_idle_device_is_there() {
                 "{}",
                 bench.name
             );
-            profiler.stop().expect("a stop");
+            if let Err(error) = profiler.stop() {
+                panic!("{}: {}", bench.name, text(&error));
+            }
         }
         let worked = work(&mut instrument, &cell);
         assert!(worked.is_ok(), "{}: after a check", bench.name);
@@ -187,7 +189,7 @@ fn each_says_whether_its_idle_device_is_there() {
             "{}",
             text(&error)
         );
-    });
+    }
 }
 
 // ---- A line that is not as it should be -------------------------------------------------------------------------------
