@@ -222,7 +222,8 @@ fn of_pass(index: usize, pass: &Pass, artefact: Artefact) -> Result<PassLag, Cal
     for _ in 0..ROUNDS {
         let placed = pass.placed(lag_s, step);
         let points: Vec<DVec3> = placed.iter().map(|p| p.point).collect();
-        let close = |p: &&DVec3| chosen.residual(**p).abs() < OUTLIER * noise(&chosen, &points);
+        let limit = OUTLIER * noise(&chosen, &points);
+        let close = |p: &&DVec3| chosen.residual(**p).abs() < limit;
         let used: Vec<DVec3> = points.iter().filter(close).copied().collect();
         let Some(form) = Form::through(&used, artefact) else {
             break;
@@ -234,7 +235,7 @@ fn of_pass(index: usize, pass: &Pass, artefact: Artefact) -> Result<PassLag, Cal
             most_s: OPEN_S,
         };
         let (change_s, u_s, rms_mm) = solved.ok_or_else(|| open(f64::INFINITY))?;
-        if !(u_s < OPEN_S) {
+        if u_s.is_nan() || u_s >= OPEN_S {
             return Err(open(u_s));
         }
         lag_s += change_s;

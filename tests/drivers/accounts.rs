@@ -13,7 +13,6 @@ use acies_drivers::{optoncdt, rf60x};
 use acies_simulators::gauge::{self, Dialect};
 use acies_simulators::point::{Fate, Record};
 use acies_simulators::wire::Desk;
-use rayon::prelude::*;
 
 /// What came of one run.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -363,6 +362,7 @@ fn every_value_of_the_serial_sensors_is_accounted_for() {
 /// lumps of a USB converter, over 600 minutes of device time each.
 #[test]
 fn every_value_of_a_two_bit_counter_is_accounted_for_over_600_seeds() {
+    use rayon::prelude::*;
     let together = "byte-loss,bursts,unasked-lines,sentinels,truncated";
     let lumped = "byte-loss,bursts,unasked-lines,sentinels,truncated,latency-lumps";
     for faults in [together, lumped] {
