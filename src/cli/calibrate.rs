@@ -26,7 +26,7 @@ use crate::config::Cell;
 ///
 /// With `--lag` it finds the lag between a robot's poses and a profiler on it instead, with the devices of the cell: so many times the
 /// robot's program goes over a sphere of about `--radius`, or without it over a plate inclined to the path, and back; a pass is over where
-/// a scan is ([device.carrier] end_mm), so that end and start are one place. Of several passes the scatter of the clocks is in the
+/// a scan is (`end_mm` of the robot), so that end and start are one place. Of several passes the scatter of the clocks is in the
 /// uncertainty too.
 #[derive(Debug, clap::Args)]
 pub struct Calibrate {
