@@ -8,6 +8,7 @@ mod assembler;
 pub mod calibrate;
 mod carried;
 pub mod clock;
+pub mod lag;
 pub mod poses;
 mod run;
 
@@ -19,7 +20,7 @@ use crate::geometry::RigidTransform;
 use crate::points::PointCloud;
 
 pub use assembler::Assembler;
-pub use carried::{Carrier, CarrierPlan, scan_carried};
+pub use carried::{CarriedRun, Carrier, CarrierPlan, run_carried, scan_carried};
 pub(crate) use run::chain;
 pub use run::{Profiling, ScanError, ScanEvent, ScanPlan, ScanWatch, scan};
 

@@ -3,14 +3,22 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use acies::acquire::{Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, scan_carried};
+use acies::acquire::lag::{Artefact, Lag, find_lag};
+use acies::acquire::{
+    Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, run_carried, scan_carried,
+};
+use acies::cell::{Daemon, DaemonOptions, Mode, Snapshot, State};
 use acies::config::Cell;
 use acies::geometry::RigidTransform;
+use acies::report::Report;
+use acies::report::wire::Status;
+use acies::store::{Order, Phase, Store};
 use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::cable::Cable;
 use acies_simulators::carried::{Motion, eased};
+use acies_simulators::demo_cell::DemoCell;
 use acies_simulators::gocator::{Form, SimulatedGocator, Surface};
 use acies_simulators::pose;
 use acies_simulators::scene::{Scene, Solid, Surfaces};
@@ -486,4 +494,385 @@ fn a_robot_that_is_lost_leaves_the_scan_incomplete_with_what_came_before() {
         "{:?}",
         view.findings
     );
+}
+
+// ---- The lag ----------------------------------------------------------------------------------------------------------
+
+/// To and fro over 120 mm in four seconds, at up to 94 mm/s, or only there; the tool looks down.
+fn to_and_fro(t: f64, back: bool) -> RigidTransform {
+    let end = if back { 4.0 } else { 2.0 };
+    let share = 0.5 - 0.5 * (std::f64::consts::PI * t.clamp(0.0, end) / 2.0).cos();
+    let down = DQuat::from_rotation_x(std::f64::consts::PI);
+    RigidTransform::new(down, DVec3::new(0.0, 120.0 * share, 300.0))
+}
+
+/// What a ray meets.
+#[derive(Clone, Copy)]
+enum Target {
+    Sphere(DVec3, f64),
+    /// A plane through a point.
+    Plane(DVec3, DVec3),
+}
+
+fn meets(target: Target, from: DVec3, along: DVec3) -> f64 {
+    match target {
+        Target::Plane(point, normal) => (point - from).dot(normal) / along.dot(normal),
+        Target::Sphere(centre, radius) => {
+            let (to, half) = (centre - from, (centre - from).dot(along));
+            let inside = radius * radius - (to.length_squared() - half * half);
+            if inside < 0.0 {
+                return f64::NAN;
+            }
+            half - inside.sqrt()
+        }
+    }
+}
+
+/// Noise of 10 um, the same every time.
+fn noise_mm(k: usize) -> f64 {
+    let mixed = (k as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (k as u64) << 17;
+    let uniform = (mixed.wrapping_mul(0xBF58_476D_1CE4_E5B9) >> 11) as f64 / (1_u64 << 53) as f64;
+    0.010 * 12_f64.sqrt() * (uniform - 0.5)
+}
+
+/// The lag that is found where profiles reach the host `late` after they are taken, and poses at once.
+fn lag_of(target: Target, artefact: Artefact, late: Duration, back: bool) -> Result<Lag, String> {
+    let began = Instant::now();
+    let base = RigidTransform::new(DQuat::IDENTITY, BASE);
+    let seconds = if back { 4.0 } else { 2.0 };
+    let poses = (0..(seconds / 0.004) as usize + 60).map(|k| {
+        let true_s = 0.004 * k as f64;
+        let pose = to_and_fro(true_s, back);
+        Pose {
+            device_time_s: ROBOT.at(true_s),
+            position_mm: pose.translation.into(),
+            rotation: pose.rotation.to_scaled_axis().into(),
+            host_time: began + Duration::from_secs_f64(true_s) + delay(k),
+        }
+    });
+    let profiles = (0..(seconds / 0.01) as usize - 20).map(|k| {
+        let true_s = 0.1 + 0.01 * k as f64;
+        let machine_from_sensor = base * to_and_fro(true_s, back) * tool_from_sensor();
+        let along = machine_from_sensor.vector(DVec3::Z);
+        let x_mm: Vec<f64> = (-20..=20).map(f64::from).collect();
+        let z = |(i, x): (usize, &f64)| {
+            let from = machine_from_sensor.point(DVec3::X * *x);
+            meets(target, from, along) + noise_mm(41 * k + i)
+        };
+        Profile {
+            sequence: k as u32,
+            boot: 0,
+            device_time_ns: (SENSOR.at(true_s) * 1e9).round() as u64,
+            encoder: None,
+            host_time: began + Duration::from_secs_f64(true_s) + delay(k + 3) + late,
+            dropped: 0,
+            saturated: false,
+            z_mm: x_mm.iter().enumerate().map(z).collect(),
+            x_mm,
+            intensity: Vec::new(),
+        }
+    });
+    let mut profilers = [Profiling {
+        name: "line".into(),
+        profiler: Box::new(Scripted::new(profiles.collect(), 0)),
+        calibration: Calibration {
+            machine_from_sensor: tool_from_sensor(),
+            travel_mm_per_count: DVec3::ZERO,
+        },
+    }];
+    let mut carrier = Carrier {
+        name: "arm".into(),
+        robot: Box::new(Scripted::new(poses.collect::<Vec<Pose>>(), 0)),
+        plan: CarrierPlan {
+            end_mm: to_and_fro(seconds, back).translation,
+            ..plan()
+        },
+    };
+    let run = run_carried(&mut profilers, &mut carrier, &mut |_: ScanEvent| {}).expect("a run");
+    assert_eq!(run.broken(&profilers, &carrier), None);
+    let pass = run.pass(0, &profilers[0], &carrier).expect("clocks");
+    find_lag(&[pass], artefact).map_err(|error| error.to_string())
+}
+
+#[test]
+fn the_lag_of_late_profiles_is_found_over_a_sphere_and_an_inclined_plate() {
+    // Below the path's middle, seen from all sides of its cap; the plate leans along the path.
+    let sphere = Target::Sphere(BASE + DVec3::new(0.0, 60.0, 40.0), 15.0);
+    let lean = DVec3::new(0.05, 0.4, 1.0).normalize();
+    let plate = Target::Plane(BASE + DVec3::new(0.0, 60.0, 40.0), lean);
+    let of_15_mm = Artefact::Sphere { radius_mm: 14.5 };
+    for late_us in [0, 700, 8_000, 45_000] {
+        for (target, artefact) in [(sphere, of_15_mm), (plate, Artefact::Plate)] {
+            let late = Duration::from_micros(late_us);
+            let lag = lag_of(target, artefact, late, true).expect("a lag");
+            let error_s = lag.lag_s + late.as_secs_f64();
+            // Beside the noise: the chord between poses of 4 ms, a t^2 / 8 = 0.3 um at 148 mm/s^2, over 50 mm/s and more.
+            let allowed_s = 3.0 * lag.u_s + 6e-6;
+            assert!(
+                error_s.abs() < allowed_s,
+                "{late_us} us, {artefact:?}: {lag:?}"
+            );
+            assert!(lag.u_s < 2e-5 && lag.rms_mm < 0.012, "{lag:?}");
+        }
+    }
+}
+
+#[test]
+fn a_lag_that_nothing_shows_is_said_to_be_open() {
+    let sphere = Target::Sphere(BASE + DVec3::new(0.0, 60.0, 40.0), 15.0);
+    let level = Target::Plane(BASE + DVec3::new(0.0, 60.0, 40.0), DVec3::Z);
+    let told = lag_of(level, Artefact::Plate, Duration::ZERO, true).expect_err("nothing shows it");
+    assert!(told.starts_with("the lag stays open"), "{told}");
+    // One way only: a lag shows in no more than the form, by the speed that changes, and the uncertainty says so.
+    let of_15_mm = Artefact::Sphere { radius_mm: 15.0 };
+    let one_way = lag_of(sphere, of_15_mm, Duration::ZERO, false).expect("a lag");
+    let both = lag_of(sphere, of_15_mm, Duration::ZERO, true).expect("a lag");
+    assert!(one_way.lag_s.abs() < 3.0 * one_way.u_s, "{one_way:?}");
+    assert!(one_way.u_s > 10.0 * both.u_s, "{one_way:?} {both:?}");
+    let none = lag_of(
+        level,
+        Artefact::Sphere { radius_mm: 15.0 },
+        Duration::ZERO,
+        true,
+    );
+    let told = none.expect_err("no sphere");
+    assert!(told.contains("no sphere of radius 15 mm among"), "{told}");
+}
+
+/// A ball under a robot that goes to and fro every six seconds, and a sensor whose picture of it is 20 ms old.
+#[test]
+fn the_command_finds_the_lag_of_simulated_devices() {
+    const OLD_S: f64 = 0.020;
+    let path = |t: f64| {
+        // It rests until the program has opened the devices.
+        let within = (t - 4.0).max(0.0) % 6.0;
+        let down = pose::Pose::turn_about(DVec3::ZERO, DVec3::X, std::f64::consts::PI);
+        let there = eased(within / 2.0) - eased((within - 2.0) / 2.0);
+        pose::Pose::shift(DVec3::new(400.0, 100.0 + 100.0 * there, 300.0)).after(down)
+    };
+    let (tool, seen) = (
+        Arc::new(Motion::new(path)),
+        Arc::new(Motion::new(move |t| path(t - OLD_S))),
+    );
+    let mut surfaces = Surfaces::default();
+    let (ball, _) = surfaces.sphere("ball", DVec3::new(150.0, 150.0, 50.0), 20.0);
+    let view = View {
+        scene: Arc::new(Scene::new(surfaces, ball)),
+        ..view()
+    };
+    let mut robot = ur_rtde::Setup::new(Arc::clone(&tool), 9);
+    robot.go_after = None;
+    let wire = Wire::tcp("127.0.0.1:0".parse().expect("an address")).expect("a socket");
+    let robot = SimulatedRobot::start(wire, robot).expect("a robot");
+    let line = SimulatedGocator::start(gocator::Setup {
+        form: Form::PointCloud,
+        rate_hz: Some(200.0),
+        ..gocator::Setup::new(13_434, Surface::Carried(Box::new(view), Arc::clone(&seen)))
+    })
+    .expect("a sensor");
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("lag");
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
+    let text =
+        std::fs::read_to_string(example.join("ur-rtde/cell.toml")).expect("the example cell");
+    let nominal = example.join("demo/part.step").display().to_string();
+    let text = text
+        .replace("../demo/part.step", &nominal)
+        .replace("192.168.1.30", robot.port())
+        .replace("address = \"192.168.1.10\"", &line.keys())
+        .replace(
+            "end_mm = [400.0, 250.0, 300.0]",
+            "end_mm = [400.0, 100.0, 300.0]",
+        );
+    let cell = folder.join("cell.toml");
+    std::fs::write(&cell, text).expect("a cell");
+    let now = Instant::now();
+    tool.go(now);
+    seen.go(now);
+    let run = std::process::Command::new(env!("CARGO_BIN_EXE_acies"))
+        .args(["calibrate", "--lag", "2", "--radius", "20", "--json"])
+        .arg(&cell)
+        .output()
+        .expect("the program");
+    let told = String::from_utf8_lossy(&run.stderr);
+    assert!(run.status.success(), "{told}");
+    assert!(
+        told.contains("pass 2 of 2: start the robot's program"),
+        "{told}"
+    );
+    let lag: serde_json::Value = serde_json::from_slice(&run.stdout).expect("JSON");
+    let (lag_s, u_s) = (lag["lag_s"].as_f64().unwrap(), lag["u_s"].as_f64().unwrap());
+    // What the two links' least delays may differ by.
+    assert!((lag_s + OLD_S).abs() < LEAST_DELAY_S, "{lag}");
+    assert!(
+        u_s < LEAST_DELAY_S && lag["passes"].as_array().unwrap().len() == 2,
+        "{lag}"
+    );
+}
+
+// ---- A whole inspection -----------------------------------------------------------------------------------------------
+
+/// Of the robot over the part, mm/s: slow, so that what the links' delays differ by is little.
+const CAREFUL_MM_S: f64 = 20.0;
+
+/// The demo's part, its two sensors side by side on a robot's tool, and its probe: the cell, and the devices that must live.
+fn robot_cell(folder: &std::path::Path) -> (Cell, impl Sized) {
+    let demo = DemoCell::new(3);
+    let way = DVec3::Y * 100.0;
+    let motion = Arc::new(Motion::straight(pose::Pose::IDENTITY, way, CAREFUL_MM_S));
+    let wire = Wire::tcp("127.0.0.1:0".parse().expect("an address")).expect("a socket");
+    let robot = SimulatedRobot::start(wire, ur_rtde::Setup::new(Arc::clone(&motion), 9));
+    let robot = robot.expect("a robot");
+    let lines = [0, 1].map(|which| {
+        let view = Box::new(demo.sensors[which].view.clone());
+        SimulatedGocator::start(gocator::Setup {
+            form: Form::PointCloud,
+            rate_hz: Some(50.0),
+            ..gocator::Setup::new(
+                100 + which as u32,
+                Surface::Carried(view, Arc::clone(&motion)),
+            )
+        })
+        .expect("a sensor")
+    });
+    let port = folder.join("ttyPROBE");
+    let probe = demo
+        .start_probe(Wire::pty(&port).expect("a port"))
+        .expect("a probe");
+    let configs = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
+    for file in ["recipe.toml", "part.step"] {
+        std::fs::copy(configs.join(file), folder.join(file)).expect("the demo's file");
+    }
+    let text = std::fs::read_to_string(configs.join("cell.toml")).expect("the demo's cell");
+    let (head, _) = text
+        .split_once("# How the profilers move")
+        .expect("its stage");
+    let (_, tail) = text.split_once("name = \"probe\"").expect("its probe");
+    let tail = tail.replace("./dev/ttyPROBE", &port.display().to_string());
+    let frame = |at: pose::Pose| {
+        let pose::Pose {
+            rotation: r,
+            translation: t,
+        } = at;
+        format!(
+            "origin_mm = {:?}\nx_axis = {:?}\nz_axis = {:?}\n",
+            t.to_array(),
+            r.x_axis.to_array(),
+            r.z_axis.to_array()
+        )
+    };
+    let mut cell = format!(
+        "{head}[[device]]\nname = \"arm\"\ndriver = \"ur-rtde\"\naddress = \"{}\"\n[device.carrier]\nend_mm = {:?}\nwithin_mm = 0.5\n\
+         silence_s = 5.0\n[device.carrier.machine_from_base]\n{}",
+        robot.port(),
+        way.to_array(),
+        frame(pose::Pose::IDENTITY)
+    );
+    for (line, sensor) in lines.iter().zip(&demo.sensors) {
+        cell += &format!(
+            "[[device]]\nname = \"{}\"\ndriver = \"gocator\"\n{}\nfirst_frame = 0\n[device.calibration]\n{}",
+            sensor.name,
+            line.keys(),
+            frame(sensor.stated_machine_from_sensor)
+        );
+    }
+    cell += &format!("[[device]]\nname = \"probe\"{tail}");
+    let path = folder.join("cell.toml");
+    std::fs::write(&path, cell).expect("a cell");
+    let cell = Cell::read(&path).unwrap_or_else(|errors| panic!("{errors}"));
+    (cell, (robot, lines, probe))
+}
+
+#[test]
+fn a_part_under_a_robot_is_inspected_from_touch_to_verdict() {
+    let folder = std::env::temp_dir().join(format!("acies-carried-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let (cell, devices) = robot_cell(&folder);
+    let store = Arc::new(Store::open(&folder.join("store")).expect("a store"));
+    let options = DaemonOptions {
+        simulated: true,
+        ..DaemonOptions::default()
+    };
+    let daemon = Daemon::start(Arc::new(cell), store, Arc::new(Cable), options).expect("a daemon");
+    let handle = daemon.handle();
+    let runtime = tokio::runtime::Builder::new_current_thread()
+        .enable_all()
+        .build();
+    let runtime = runtime.expect("a runtime");
+    let until = |is_so: &dyn Fn(&Snapshot) -> bool| {
+        let mut follow = handle.follow();
+        let waited = runtime.block_on(async {
+            let wait = follow.wait_for(|snapshot| is_so(snapshot));
+            let limit = Duration::from_secs(300);
+            tokio::time::timeout(limit, wait)
+                .await
+                .map(|found| drop(found.expect("a daemon")))
+        });
+        assert!(waited.is_ok(), "never so: {:#?}", handle.snapshot());
+    };
+    until(&|snapshot| snapshot.state == State::Ready);
+    let order = Order {
+        part_serial: "R-1".into(),
+        ..Order::default()
+    };
+    let (asked, _) = runtime
+        .block_on(handle.start(order, "anna", None, Mode::Single))
+        .map_err(|(refusal, _)| refusal)
+        .expect("taken");
+    until(&|snapshot| {
+        let work = snapshot
+            .acquiring
+            .iter()
+            .chain(&snapshot.computing)
+            .chain(&snapshot.queue);
+        !work.into_iter().any(|job| job.id == asked.id)
+    });
+    let ended = handle
+        .store()
+        .inspection(asked.id)
+        .expect("it is in the history");
+    assert_eq!(ended.phase, Phase::Done, "{}", ended.reason);
+    let report: Report =
+        serde_json::from_str(&handle.store().report_json(asked.id).expect("a report"))
+            .expect("JSON");
+    // The defects that were made, found from a robot: the wall's offset of 60 um at both of its edges, a good edge where one was made.
+    assert_eq!(report.verdict, Status::NotOk, "{}", report.reason);
+    assert_eq!(report.alignment.status, Status::Ok, "{}", report.reason);
+    assert!(
+        report.missing_edges.is_empty(),
+        "{:?}",
+        report.missing_edges
+    );
+    let edge = |entity| {
+        let found = report
+            .edges
+            .iter()
+            .find(|edge| edge.nominal_entity == entity);
+        &found.expect("an edge of the part").summary
+    };
+    // What the two views' times differ by, at this speed; 5 um are the demo's own.
+    let allowed_mm = 0.005 + 0.5 * LEAST_DELAY_S * CAREFUL_MM_S;
+    let near = |found: Option<acies::report::wire::Spread>, made_mm: f64| {
+        let mean = found.expect("measured").mean;
+        assert!(
+            (mean - made_mm).abs() < allowed_mm,
+            "{mean} mm, made {made_mm} mm"
+        );
+    };
+    near(edge(237).d1_mm, 0.060);
+    near(edge(181).d2_mm, 0.060);
+    near(edge(237).d2_mm, 0.0);
+    near(edge(337).d1_mm, 0.0);
+    let names: Vec<&str> = report
+        .devices
+        .iter()
+        .map(|device| device.name.as_str())
+        .collect();
+    assert!(
+        names.contains(&"left") && names.contains(&"right"),
+        "{names:?}"
+    );
+    drop((handle, daemon, devices));
+    let _ = std::fs::remove_dir_all(&folder);
 }

@@ -261,7 +261,12 @@ fn nothing_is_ignored_and_nobody_sleeps_in_tests() {
 
 #[test]
 fn every_dependency_says_what_it_is_for() {
-    for manifest in ["Cargo.toml", "drivers/Cargo.toml", "simulators/Cargo.toml"] {
+    for manifest in [
+        "Cargo.toml",
+        "drivers/Cargo.toml",
+        "drivers/usb-queue/Cargo.toml",
+        "simulators/Cargo.toml",
+    ] {
         let text = fs::read_to_string(root().join(manifest)).expect("a manifest");
         let mut inside = false;
         for line in text.lines() {
@@ -276,6 +281,27 @@ fn every_dependency_says_what_it_is_for() {
             }
         }
     }
+}
+
+/// One package may hold unsafe code, and says why it is sound; everywhere else the compiler forbids it.
+#[test]
+fn unsafe_code_stands_in_one_place() {
+    for library in ["src/lib.rs", "drivers/src/lib.rs", "simulators/src/lib.rs"] {
+        let text = fs::read_to_string(root().join(library)).expect("a library");
+        assert!(text.contains("#![forbid(unsafe_code)]"), "{library}");
+    }
+    let text = fs::read_to_string(root().join("drivers/usb-queue/src/lib.rs")).expect("a library");
+    let code = text
+        .lines()
+        .filter(|line| !line.trim_start().starts_with("//"));
+    let blocks: usize = code.map(|line| line.matches("unsafe {").count()).sum();
+    let reasons = text.matches("// SAFETY: ").count();
+    assert!(
+        blocks <= 8,
+        "{blocks} blocks: is it still small enough to be seen through?"
+    );
+    assert!(reasons >= blocks, "{reasons} reasons for {blocks} blocks");
+    assert!(text.contains("# Why it is sound"));
 }
 
 #[test]

@@ -6,13 +6,17 @@
 use std::hint::black_box;
 use std::io::Write;
 use std::process::Command;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use acies_drivers::ALL;
 use acies_drivers::device::{Instrument, Profiler};
+use acies_drivers::error::LinkError;
 use acies_drivers::gocator::message::{Content, Decoder, message};
 use acies_drivers::ippdme::line;
 use acies_drivers::link::cable::Cable;
+use acies_drivers::link::usb::{OneByOne, Request, UsbInterface, UsbLink, UsbStream, UsbTarget};
+use acies_drivers::link::{Link, Links, Target};
 use acies_drivers::u3v_profiler::block::{Geometry, pixel, points_mm};
 use acies_simulators::gocator::{Form, Setup, SimulatedGocator, Surface};
 use acies_simulators::u3v;
@@ -97,14 +101,74 @@ fn seconds() -> u64 {
     text.parse().unwrap_or(10)
 }
 
+/// Links whose USB streams have one transfer in flight, to compare with.
+struct Single;
+
+struct SingleLink(Arc<dyn UsbLink>);
+
+impl Links for Single {
+    fn open(&self, target: &Target) -> Result<Arc<dyn Link>, LinkError> {
+        Cable.open(target)
+    }
+
+    fn open_usb(&self, target: &UsbTarget) -> Result<Arc<dyn UsbLink>, LinkError> {
+        Ok(Arc::new(SingleLink(Cable.open_usb(target)?)))
+    }
+}
+
+type Passed = Result<Option<usize>, LinkError>;
+
+impl UsbLink for SingleLink {
+    fn interfaces(&self) -> &[UsbInterface] {
+        self.0.interfaces()
+    }
+
+    fn claim(&self, interface: u8) -> Result<(), LinkError> {
+        self.0.claim(interface)
+    }
+
+    fn control_in(&self, request: Request, buffer: &mut [u8], deadline: Instant) -> Passed {
+        self.0.control_in(request, buffer, deadline)
+    }
+
+    fn control_out(&self, request: Request, bytes: &[u8], deadline: Instant) -> Passed {
+        self.0.control_out(request, bytes, deadline)
+    }
+
+    fn read(&self, endpoint: u8, buffer: &mut [u8], deadline: Instant) -> Passed {
+        self.0.read(endpoint, buffer, deadline)
+    }
+
+    fn write(&self, endpoint: u8, bytes: &[u8], deadline: Instant) -> Passed {
+        self.0.write(endpoint, bytes, deadline)
+    }
+
+    fn stream(
+        &self,
+        endpoint: u8,
+        _: usize,
+        bytes: usize,
+    ) -> Result<Box<dyn UsbStream + '_>, LinkError> {
+        Ok(Box::new(OneByOne::new(self, endpoint, bytes)))
+    }
+
+    fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError> {
+        self.0.clear_halt(endpoint)
+    }
+}
+
 fn open(driver: &str, table: &str) -> Box<dyn Profiler> {
+    open_over(&Cable, driver, table)
+}
+
+fn open_over(links: &dyn Links, driver: &str, table: &str) -> Box<dyn Profiler> {
     let driver = ALL
         .iter()
         .find(|known| known.name == driver)
         .expect("a driver");
     let table = toml::from_str(table).expect("the bench's TOML");
     let setup = (driver.configure)(table).unwrap_or_else(|mistakes| panic!("{mistakes:?}"));
-    match setup.open(&Cable) {
+    match setup.open(links) {
         Ok(Instrument::Profiler(profiler)) => profiler,
         Ok(_) => panic!("no profiler"),
         Err(error) => panic!("{error}: {:?}", std::error::Error::source(&error)),
@@ -116,14 +180,17 @@ fn sustain(name: &str, profiler: &mut dyn Profiler) {
     profiler.start().expect("a start");
     let began = Instant::now();
     let (mut profiles, mut points) = (0_u64, 0_u64);
+    let mut late = Vec::new();
     while began.elapsed() < Duration::from_secs(seconds()) {
         let profile = profiler.next(Instant::now() + Duration::from_secs(10));
         let profile = profile.expect("a link").expect("a profile in time");
         profiles += 1;
+        late.push(profile.host_time.elapsed());
         points += profile.z_mm.len() as u64;
     }
     let elapsed = began.elapsed().as_secs_f64();
     let rest = profiler.stop().expect("a stop").len() as u64;
+    late.sort_unstable();
     let losses = profiler.losses();
     say(&format!(
         "{name}: {:.1} M points/s, {:.0} profiles/s of {COLUMNS} points, sustained for {elapsed:.0} s; lost {}, rejected {}, dropped {} of {}",
@@ -133,6 +200,11 @@ fn sustain(name: &str, profiler: &mut dyn Profiler) {
         losses.rejected,
         losses.dropped_by_device,
         profiles + rest,
+    ));
+    say(&format!(
+        "  from its last byte to the caller: median {:?}, worst {:?}",
+        late[late.len() / 2],
+        late[late.len() - 1]
     ));
     assert_eq!(
         losses.lost_on_link + losses.rejected + losses.dropped_by_device,
@@ -180,11 +252,13 @@ fn usb() {
             ..u3v::Setup::new("SN-1", u3v::Surface::Wave(COLUMNS))
         });
         let carrier = Carrier::start(&folder, Socket::new(device)).expect("a carrier");
-        let status = Command::new(std::env::current_exe().expect("this program"))
-            .envs(carrier.environment())
-            .env(CHILD, format!("{lines} {format}"))
-            .status();
-        assert!(status.is_ok_and(|status| status.success()), "the child");
+        for way in ["overlapping", "single"] {
+            let status = Command::new(std::env::current_exe().expect("this program"))
+                .envs(carrier.environment())
+                .env(CHILD, format!("{lines} {format} {way}"))
+                .status();
+            assert!(status.is_ok_and(|status| status.success()), "the child");
+        }
         drop(carrier);
         let _ = std::fs::remove_dir_all(folder);
     }
@@ -192,10 +266,17 @@ fn usb() {
 
 fn main() {
     if let Ok(child) = std::env::var(CHILD) {
-        let (lines, format) = child.split_once(' ').expect("lines and a format");
+        let mut words = child.split(' ');
+        let (Some(lines), Some(format), Some(way)) = (words.next(), words.next(), words.next())
+        else {
+            panic!("lines, a format and a way: {child}");
+        };
         let table = format!("features = [['PixelFormat', '{format}']]\nfirst_block = 0");
-        let mut profiler = open("u3v-profiler", &table);
-        let name = format!("u3v-profiler over simulated USB, {format}, {lines} lines a block");
+        let links: &dyn Links = if way == "single" { &Single } else { &Cable };
+        let mut profiler = open_over(links, "u3v-profiler", &table);
+        let name = format!(
+            "u3v-profiler over simulated USB, {format}, {lines} lines a block, {way} transfers"
+        );
         sustain(&name, profiler.as_mut());
         return;
     }

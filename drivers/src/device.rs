@@ -80,6 +80,18 @@ impl Instrument {
         }
     }
 
+    /// Asks it whether it is there, while it stands still: [`Profiler::check`].
+    ///
+    /// # Errors
+    /// As [`Profiler::check`].
+    pub fn check(&mut self) -> Result<Presence, crate::error::DeviceError> {
+        match self {
+            Instrument::Profiler(profiler) => profiler.check(),
+            Instrument::Probe(probe) => probe.check(),
+            Instrument::Robot(robot) => robot.check(),
+        }
+    }
+
     /// The word for its kind.
     pub fn kind(&self) -> &'static str {
         match self {
@@ -88,6 +100,15 @@ impl Instrument {
             Instrument::Robot(_) => "robot",
         }
     }
+}
+
+/// What a check found out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Presence {
+    /// It answered, as itself.
+    Answered,
+    /// Its protocol has no question for this: only opening it anew tells.
+    Unknown,
 }
 
 /// Who an instrument says it is.
@@ -101,6 +122,31 @@ pub struct Identity {
     pub serial: String,
     /// Firmware, as read.
     pub firmware: String,
+}
+
+/// The answer of a check in which a device named itself: the same as before, or an error.
+pub(crate) fn same(
+    port: &str,
+    before: &str,
+    now: &str,
+) -> Result<Presence, crate::error::DeviceError> {
+    match before == now {
+        true => Ok(Presence::Answered),
+        false => Err(crate::error::DeviceError::WrongDevice {
+            port: port.to_owned(),
+            found: now.to_owned(),
+            expected: before.to_owned(),
+        }),
+    }
+}
+
+/// The error of a check while a run is on.
+pub(crate) fn checked_in_a_run(port: &str) -> crate::error::DeviceError {
+    crate::error::DeviceError::OutOfOrder {
+        port: port.to_owned(),
+        action: "check",
+        needed: "the run to be stopped: a device that streams is there",
+    }
 }
 
 /// What was lost on the way, since the run started. Nothing is lost silently.
@@ -148,6 +194,15 @@ pub trait Profiler: Send {
     fn stop(&mut self) -> Result<Vec<Profile>, crate::error::DeviceError>;
     /// What was lost since [`Profiler::start`].
     fn losses(&self) -> Losses;
+    /// Asks an open device that stands still whether it is there, and the same as when it was opened: one question, without light,
+    /// motion or a change of settings. Where the protocol has none, the answer is [`Presence::Unknown`].
+    ///
+    /// # Errors
+    /// That it is gone, silent or another one: drop it and open anew. [`crate::error::DeviceError::OutOfOrder`] while a run is on, which
+    /// tells by itself.
+    fn check(&mut self) -> Result<Presence, crate::error::DeviceError> {
+        Ok(Presence::Unknown)
+    }
 }
 
 /// An open touch probe on a controller that moves it.
@@ -177,6 +232,13 @@ pub trait Probe: Send {
         step_mm: f64,
         timeout: Duration,
     ) -> Result<Vec<Touch>, crate::error::DeviceError>;
+    /// As [`Profiler::check`].
+    ///
+    /// # Errors
+    /// As [`Profiler::check`].
+    fn check(&mut self) -> Result<Presence, crate::error::DeviceError> {
+        Ok(Presence::Unknown)
+    }
 }
 
 /// An open robot that carries a profiler: a stream of poses.
@@ -200,4 +262,11 @@ pub trait Robot: Send {
     fn stop(&mut self) -> Result<Vec<Pose>, crate::error::DeviceError>;
     /// Poses lost since [`Robot::start`], by the robot's own time.
     fn losses(&self) -> Losses;
+    /// As [`Profiler::check`].
+    ///
+    /// # Errors
+    /// As [`Profiler::check`].
+    fn check(&mut self) -> Result<Presence, crate::error::DeviceError> {
+        Ok(Presence::Unknown)
+    }
 }

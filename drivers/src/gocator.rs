@@ -26,7 +26,10 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Presence, Profiler, Setup,
+    checked_in_a_run, same,
+};
 use crate::error::{DecodeError, DeviceError, LinkError};
 use crate::link::{Link, Links, Target};
 use crate::settings::Keys;
@@ -442,6 +445,21 @@ impl Profiler for Gocator {
 
     fn losses(&self) -> Losses {
         self.shared.lock().losses
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        {
+            let mut inbox = self.shared.lock();
+            if let Some(over) = &mut inbox.over {
+                return Err(over.error(&self.port));
+            }
+            if inbox.running {
+                return Err(checked_in_a_run(&self.port));
+            }
+        }
+        let mut control = self.control.lock().unwrap_or_else(PoisonError::into_inner);
+        let now = control.introduce(None)?;
+        same(&self.port, &self.identity.serial, &now.serial)
     }
 }
 

@@ -31,7 +31,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::capture::Touch;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Probe, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Presence, Probe, Setup, same,
+};
 use crate::error::{DeviceError, LinkError};
 use crate::link::{Link, Links, Target};
 use crate::settings::Keys;
@@ -701,6 +703,11 @@ impl Probe for GrblProbe {
             capability: "scanning along a line",
             key: "driver",
         })
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        let now = self.controller.identify(None)?;
+        same(&self.controller.port, &self.identity.serial, &now.serial)
     }
 }
 

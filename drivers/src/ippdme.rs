@@ -22,7 +22,9 @@
 use std::time::{Duration, Instant};
 
 use crate::capture::Touch;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Probe, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Presence, Probe, Setup, same,
+};
 use crate::error::DeviceError;
 use crate::link::{self, Links, Target};
 use crate::settings::Keys;
@@ -375,6 +377,11 @@ impl Probe for IppDme {
             host_time,
         });
         Ok(touches.collect())
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        let class = text_of(&self.session.ask("GetMachineClass()", SHORT)?);
+        same(&self.port, &self.identity.model, &class)
     }
 }
 

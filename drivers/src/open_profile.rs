@@ -28,7 +28,10 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Presence, Profiler, Setup,
+    checked_in_a_run, same,
+};
 use crate::error::{DecodeError, DeviceError, LinkError};
 use crate::link::{Link, Links, Target};
 use crate::settings::Keys;
@@ -492,6 +495,17 @@ impl Profiler for OpenProfile {
 
     fn losses(&self) -> Losses {
         self.shared.lock().losses
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        let run = self.shared.lock().run;
+        if run.is_some_and(|run| run.stopped.is_none()) {
+            return Err(checked_in_a_run(&self.port));
+        }
+        let Reply::Identity(identity) = self.ask(Command::Hello)? else {
+            return Err(self.unexpected(Command::Hello));
+        };
+        same(&self.port, &self.identity.serial, &identity.serial)
     }
 }
 

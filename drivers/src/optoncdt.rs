@@ -37,7 +37,8 @@ use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
 use crate::device::{
-    Claim, Configured, Driver, Identity, Instrument, Losses, Mistake, Profiler, Setup,
+    Claim, Configured, Driver, Identity, Instrument, Losses, Mistake, Presence, Profiler, Setup,
+    checked_in_a_run, same,
 };
 use crate::error::{DecodeError, DeviceError};
 use crate::link::pump::{Chunk, Pump};
@@ -497,10 +498,7 @@ impl Sensor {
             other => Err(other),
         })?;
         let info = self.command("GETINFO")?;
-        let field = |name: &str| {
-            let line = info.lines().find_map(|line| line.split_once(name));
-            line.map(|(_, value)| value.trim().to_owned())
-        };
+        let field = |name: &str| field(&info, name);
         let (Some(model), Some(serial)) = (field("Name:"), field("Serial:")) else {
             return Err(self.bad(DecodeError::WrongReply { command: "GETINFO" }));
         };
@@ -706,6 +704,12 @@ impl Sensor {
     }
 }
 
+/// The value of a line of GETINFO.
+fn field(info: &str, name: &str) -> Option<String> {
+    let line = info.lines().find_map(|line| line.split_once(name));
+    line.map(|(_, value)| value.trim().to_owned())
+}
+
 /// The line of a reply that begins with E and three digits.
 fn error_line(reply: &str) -> Option<&str> {
     reply.lines().map(str::trim).find(|line| {
@@ -792,6 +796,15 @@ impl Profiler for Sensor {
 
     fn losses(&self) -> Losses {
         self.account
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        if self.run.is_some() {
+            return Err(checked_in_a_run(self.pump.port()));
+        }
+        let info = self.command("GETINFO")?;
+        let serial = field(&info, "Serial:").unwrap_or_default();
+        same(self.pump.port(), &self.identity.serial, &serial)
     }
 }
 

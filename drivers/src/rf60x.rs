@@ -34,7 +34,10 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Presence, Profiler, Setup,
+    checked_in_a_run, same,
+};
 use crate::error::{DecodeError, DeviceError};
 use crate::link::pump::Pump;
 use crate::link::{Links, Parity, Target};
@@ -42,8 +45,10 @@ use crate::point::{Layout, Rows, Value};
 use crate::settings::Keys;
 
 mod burst;
+mod count;
 
-pub use burst::{ANSWER_MAX, Answer, Count, Decoder};
+pub use burst::{ANSWER_MAX, Answer, Decoder};
+pub use count::Count;
 
 /// The line in [`crate::ALL`].
 pub const DRIVER: Driver = Driver {
@@ -235,13 +240,13 @@ pub struct Stream {
 }
 
 impl Stream {
-    /// For a sensor with a range, whose results are `period` apart.
+    /// For a sensor with a range, whose results come by time, `period` apart.
     pub fn new(range_mm: f64, zero_is_nothing: bool, period: Duration, layout: Layout) -> Stream {
         Stream {
             range_mm,
             zero_is_nothing,
             period,
-            count: Count::default(),
+            count: Count::new(Some(period)),
             rows: Rows::new(layout),
             damaged: 0,
             skipped_before: 0,
@@ -250,7 +255,7 @@ impl Stream {
 
     /// Takes one burst; `skipped_bytes` is what the decoder threw away so far.
     pub fn take(&mut self, answer: &Answer, skipped_bytes: u64, host_time: Instant) {
-        let number = self.count.number(answer.counter, skipped_bytes);
+        let number = self.count.number(answer.counter, skipped_bytes, host_time);
         match distance_mm(
             answer.word(0).unwrap_or(u16::MAX),
             self.range_mm,
@@ -278,6 +283,11 @@ impl Stream {
     /// Ends the profile under way.
     pub fn finish(&mut self) {
         self.rows.finish();
+    }
+
+    /// By so many values [`Stream::losses`] may be wrong, either way: [`Count::unsure`].
+    pub fn unsure(&self) -> u64 {
+        self.count.unsure
     }
 
     /// What was lost; `skipped_bytes` is what the decoder threw away so far.
@@ -382,9 +392,17 @@ impl Bus {
         let low = self.get(first, parameter::PERIOD_LOW)?;
         let high = self.get(first, parameter::PERIOD_HIGH)?;
         let us = u16::from_le_bytes([low, high]).max(1);
-        self.period = Duration::from_micros(us.into());
+        self.period = Duration::from_micros(us.into()).max(self.on_line());
         self.by_time = self.get(first, parameter::CONTROL)? & 1 == 0;
         Ok(())
+    }
+
+    /// What a result takes on a serial line: four characters of 11 bits. A sensor that measures faster sends no faster.
+    fn on_line(&self) -> Duration {
+        match &self.settings.target {
+            Target::Serial { line, .. } => Duration::from_secs_f64(44.0 / f64::from(line.baud)),
+            Target::Tcp { .. } => Duration::ZERO,
+        }
     }
 
     fn bad(&self, source: DecodeError) -> DeviceError {
@@ -557,6 +575,9 @@ impl Bus {
             self.period,
             self.settings.layout,
         );
+        if !self.by_time {
+            stream.count = Count::new(None);
+        }
         stream.skipped_before = self.decoder.skipped_bytes();
         stream.count.begin(self.decoder.skipped_bytes());
         self.start_stream()?;
@@ -755,6 +776,14 @@ impl Profiler for Bus {
                     }
                 }
                 stream.finish();
+                if stream.unsure() > 0 {
+                    let (port, unsure) = (self.pump.port(), stream.unsure());
+                    tracing::warn!(
+                        port,
+                        unsure,
+                        "so many values may be lost that are not counted, or not lost that are"
+                    );
+                }
                 self.account = stream.losses(self.decoder.skipped_bytes());
                 profiles.extend(std::iter::from_fn(|| stream.pop()));
                 self.hush()?;
@@ -766,6 +795,18 @@ impl Profiler for Bus {
 
     fn losses(&self) -> Losses {
         self.account
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        if self.run.is_some() {
+            return Err(checked_in_a_run(self.pump.port()));
+        }
+        let mut serials = Vec::new();
+        for address in self.settings.addresses.clone() {
+            let answer = self.ask(address, code::IDENTIFY, &[], 8)?;
+            serials.push(answer.word(2).unwrap_or(0).to_string());
+        }
+        same(self.pump.port(), &self.identity.serial, &serials.join(", "))
     }
 }
 

@@ -37,7 +37,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Presence, Profiler, Setup,
+    checked_in_a_run, same,
+};
 use crate::error::{DecodeError, DeviceError};
 use crate::link::{DataBits, Line as LineFormat, Link, Links, Parity, StopBits, Target};
 use crate::settings::Keys;
@@ -256,6 +259,7 @@ impl Setup for Settings {
             settings: self.clone(),
         };
         gauge.introduce()?;
+        gauge.fresh = false;
         Ok(Instrument::Profiler(Box::new(gauge)))
     }
 }
@@ -587,7 +591,9 @@ impl Profiler for Gauge {
             let _ = self.laser(false);
             return Err(error);
         }
-        self.fresh = false;
+        if self.fresh {
+            return Err(self.switched_on());
+        }
         self.run = Some(Run {
             due: Instant::now(),
             number: 0,
@@ -624,6 +630,20 @@ impl Profiler for Gauge {
 
     fn losses(&self) -> Losses {
         self.account
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        if self.run.is_some() {
+            return Err(checked_in_a_run(&self.port));
+        }
+        let (before, account) = (self.identity.serial.clone(), self.account);
+        let introduced = self.introduce();
+        self.account = account;
+        introduced?;
+        match self.fresh {
+            true => Err(self.switched_on()),
+            false => same(&self.port, &before, &self.identity.serial),
+        }
     }
 }
 

@@ -26,7 +26,10 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Presence, Profiler, Setup,
+    checked_in_a_run, same,
+};
 use crate::error::{DecodeError, DeviceError, LinkError};
 use crate::link::Links;
 use crate::link::usb::{UsbLink, UsbTarget};
@@ -666,6 +669,15 @@ impl Profiler for U3vProfiler {
 
     fn losses(&self) -> Losses {
         self.shared.lock().losses
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        if self.shared.lock().running {
+            return Err(checked_in_a_run(&self.port));
+        }
+        let control = &mut self.registers().control;
+        let serial = control.read_text(abrm::SERIAL, abrm::TEXT)?;
+        same(&self.port, &self.identity.serial, &serial)
     }
 }
 

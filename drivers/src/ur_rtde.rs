@@ -17,7 +17,10 @@ use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use crate::capture::Pose;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Robot, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Presence, Robot, Setup,
+    checked_in_a_run,
+};
 use crate::error::{DecodeError, DeviceError};
 use crate::link::pump::Pump;
 use crate::link::{self, Links, Target};
@@ -496,6 +499,14 @@ impl Robot for UrRobot {
 
     fn losses(&self) -> Losses {
         self.losses
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        if self.run.is_some() {
+            return Err(checked_in_a_run(&self.session.port()));
+        }
+        // It has no serial number to compare: an answer is all there is.
+        self.session.control_version().map(|_| Presence::Answered)
     }
 }
 

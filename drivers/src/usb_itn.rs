@@ -19,7 +19,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::capture::Profile;
-use crate::device::{Claim, Configured, Driver, Identity, Instrument, Losses, Profiler, Setup};
+use crate::device::{
+    Claim, Configured, Driver, Identity, Instrument, Losses, Presence, Profiler, Setup,
+    checked_in_a_run,
+};
 use crate::error::{DecodeError, DeviceError, LinkError};
 use crate::link::Links;
 use crate::link::usb::{Request, UsbLink, UsbTarget};
@@ -60,6 +63,8 @@ const ASK: Request = Request {
 /// How long a control request and a reading are waited for.
 const CONTROL: Duration = Duration::from_secs(1);
 const READING: Duration = Duration::from_secs(2);
+/// Readings in a row that did not come, after which a gauge is silent.
+const MISSED: u32 = 3;
 const MM_PER_INCH: f64 = 25.4;
 
 // ---- Settings ---------------------------------------------------------------------------------------------------------
@@ -223,6 +228,8 @@ struct Run {
     asked: u32,
     /// One is asked for and has not come; until when it is waited for.
     pending: Option<Instant>,
+    /// How many before it did not come.
+    missed: u32,
 }
 
 impl UsbItn {
@@ -309,6 +316,7 @@ impl Profiler for UsbItn {
             next: now,
             asked: 0,
             pending: None,
+            missed: 0,
         });
         Ok(())
     }
@@ -332,6 +340,7 @@ impl Profiler for UsbItn {
             match (found, run.pending) {
                 (Some(reading), Some(_)) => {
                     run.pending = None;
+                    run.missed = 0;
                     self.run = Some(run);
                     return Ok(Some(self.profile(reading, &run)));
                 }
@@ -339,6 +348,14 @@ impl Profiler for UsbItn {
                 (None, Some(until)) if now >= until => {
                     self.losses.lost_on_link += 1;
                     run.pending = None;
+                    run.missed += 1;
+                    if run.missed >= MISSED {
+                        self.run = Some(run);
+                        return Err(DeviceError::Silent {
+                            port: self.port.clone(),
+                            deadline_s: (READING * MISSED).as_secs_f64(),
+                        });
+                    }
                 }
                 (None, None) if now >= run.next => {
                     self.ask()?;
@@ -370,6 +387,21 @@ impl Profiler for UsbItn {
 
     fn losses(&self) -> Losses {
         self.losses
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        if self.run.is_some() {
+            return Err(checked_in_a_run(&self.port));
+        }
+        let deadline = Instant::now() + CONTROL;
+        let state = self.link.control_in(STATE, &mut [0; 1], deadline);
+        match state.map_err(|source| self.gone(source))? {
+            Some(_) => Ok(Presence::Answered),
+            None => Err(DeviceError::Silent {
+                port: self.port.clone(),
+                deadline_s: CONTROL.as_secs_f64(),
+            }),
+        }
     }
 }
 

@@ -6,7 +6,7 @@
 
 mod wire;
 
-pub(crate) use wire::resample;
+pub(crate) use wire::{resample, shake};
 
 use std::io;
 use std::net::{Ipv4Addr, SocketAddr, TcpListener, TcpStream};
@@ -65,6 +65,14 @@ pub struct Misdeeds {
     pub refuse_start: Option<i32>,
     /// Triggers dropped per frame that is taken.
     pub trigger_drops: u32,
+    /// The encoder reads up to so many counts beside the truth.
+    pub encoder_jitter: u32,
+    /// Numbers of replies and messages come with the great end first.
+    pub swap_bytes: bool,
+    /// Replies come so much later.
+    pub late: Option<Duration>,
+    /// So many replies that nobody asked for come before each one.
+    pub stray_replies: u32,
 }
 
 /// What the sensor says it is, and how it plays.
@@ -344,6 +352,16 @@ fn serve_control(stream: TcpStream, setup: &Setup, shared: &Shared) {
                 true => b"HTTP/1.1 400 Bad Request\r\n\r\n".to_vec(),
                 false => answer(id, &payload, setup, shared),
             };
+            let reply = wire::spoilt(reply, &setup.misdeeds);
+            if let Some(late) = setup.misdeeds.late {
+                let due = Instant::now() + late;
+                let mut state = lock(&shared.state);
+                while !state.quit && Instant::now() < due {
+                    let left = due.saturating_duration_since(Instant::now());
+                    let waited = shared.changed.wait_timeout(state, left);
+                    state = waited.unwrap_or_else(|e| e.into_inner()).0;
+                }
+            }
             if wire::send(&stream, &reply, None, || shared.quit()).is_err() {
                 return;
             }

@@ -76,6 +76,8 @@ pub struct Misdeeds {
     pub fail_point: Option<(u32, u32)>,
     /// A line of the n-th point has a character that is not allowed.
     pub garble_point: Option<u32>,
+    /// Every acknowledgement comes so much later, ms.
+    pub late_ms: Option<u32>,
 }
 
 /// What the server was asked, and did.
@@ -291,6 +293,9 @@ impl Server<'_> {
         let session = matches!(method, "StartSession" | "EndSession");
         if !session && !self.session || method == "StartSession" && self.session {
             return self.refuse(tag, command, (3, 8, "Protocol error"));
+        }
+        if let Some(ms) = self.setup.misdeeds.late_ms {
+            std::thread::sleep(Duration::from_millis(ms.into()));
         }
         self.send(&format!("{tag} &"))?;
         if self.setup.misdeeds.chatter && !event {

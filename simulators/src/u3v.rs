@@ -74,6 +74,10 @@ pub struct Misdeeds {
     pub leader_50: bool,
     /// The GenICam file is said to be of so many bytes.
     pub lying_file: Option<u64>,
+    /// The encoder reads up to so many counts beside the truth.
+    pub encoder_jitter: u32,
+    /// The device's clock runs fast by so many parts per million.
+    pub drift_ppm: u32,
 }
 
 /// What the device is.
@@ -87,6 +91,10 @@ pub struct Setup {
     pub surface: Surface,
     /// Lines in a block.
     pub lines: u32,
+    /// Bytes of the encoder's chunk: 4 or 8.
+    pub encoder_bytes: usize,
+    /// What the encoder adds to the scene's or the wave's counts.
+    pub encoder_from: i64,
     /// Chunk ids and lengths are big-endian.
     pub big_chunks: bool,
     /// The GenICam file is zipped.
@@ -107,6 +115,8 @@ impl Setup {
             seed: 1,
             surface,
             lines: 1,
+            encoder_bytes: 8,
+            encoder_from: 0,
             big_chunks: false,
             zipped: false,
             rate_hz: None,
@@ -285,7 +295,9 @@ impl Profiler {
         if gap {
             return;
         }
-        let time_ns = 1_000_000_000 + id * 200_000;
+        let since_ns = id * 200_000;
+        let fast = since_ns / 1_000_000 * u64::from(misdeeds.drift_ppm);
+        let time_ns = 1_000_000_000 + since_ns + fast;
         let payload = self.payload(id, time_ns);
         if zero {
             self.stream.push_back(Vec::new());
@@ -359,8 +371,13 @@ impl Profiler {
         }
         let image = bytes.len() as u32;
         self.chunk_tail(&mut bytes, 1, image);
-        bytes.extend(encoder.to_le_bytes());
-        self.chunk_tail(&mut bytes, 0xE0, 8);
+        let shaken = encoder
+            + self.setup.encoder_from
+            + crate::gocator::shake(self.setup.misdeeds.encoder_jitter, id);
+        let counts = shaken.to_le_bytes();
+        let kept = self.setup.encoder_bytes;
+        bytes.extend(&counts[..kept]);
+        self.chunk_tail(&mut bytes, 0xE0, kept as u32);
         bytes.extend((time_ns + 7).to_le_bytes());
         self.chunk_tail(&mut bytes, 0xE1, 8);
         bytes

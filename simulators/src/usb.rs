@@ -1,7 +1,8 @@
 //! Simulated USB devices: what a device does with transfers ([`Model`]), the socket it is plugged into ([`Socket`]), and how an unmodified program gets
-//! at it ([`preload`]). A test may also call the socket itself, in the same process.
+//! at it ([`preload`]), or a whole kernel ([`redir`]). A test may also call the socket itself, in the same process.
 
 pub mod preload;
+pub mod redir;
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};

@@ -75,6 +75,16 @@ pub enum CalibrateError {
         /// Its standard uncertainty, with its unit.
         u: String,
     },
+    /// The passes say nothing of the lag.
+    #[error(
+        "the lag stays open (standard uncertainty {u_s:.1e} s, at most {most_s} s is allowed); go over the sphere, or over a plate inclined to the path, to and fro"
+    )]
+    LagOpen {
+        /// Standard uncertainty of a pass, s.
+        u_s: f64,
+        /// The most that is allowed, s.
+        most_s: f64,
+    },
     /// The iteration went nowhere.
     #[error(
         "the calibration does not settle: residuals of {rms_mm} mm, expected those of the sensor's noise; check that scans and centres belong together"

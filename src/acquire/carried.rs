@@ -8,7 +8,7 @@
 //! Memory: 18 bytes a column until the run is over, 32 bytes a point after it.
 
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -18,8 +18,9 @@ use acies_drivers::error::DeviceError;
 use glam::{DQuat, DVec3};
 
 use super::clock::{ClockFit, fit_clock};
+use super::lag::Pass;
 use super::poses::{PoseGap, PoseTrack};
-use super::run::{Message, POLL, QUEUE_PROFILES, append, chain, deliver, stop_after_failure};
+use super::run::{Message, POLL, append, chain, deliver_all, start_all};
 use super::{Profiling, Scan, ScanError, ScanEvent, ScanWatch, ViewRecord};
 use crate::geometry::RigidTransform;
 use crate::points::{Frame, Origin, PointCloud, View};
@@ -85,45 +86,45 @@ pub fn scan_carried(
     carrier: &mut Carrier,
     watch: &mut dyn ScanWatch,
 ) -> Result<(Scan, Vec<Profiling>), ScanError> {
+    let run = run_carried(&mut profilers, carrier, watch)?;
+    let scan = place(&profilers, run, carrier);
+    Ok((scan, profilers))
+}
+
+/// What a run by a robot brought, before anything of it is placed.
+pub struct CarriedRun {
+    took: Vec<Took>,
+    poses: Poses,
+    began: Instant,
+}
+
+/// Runs once as [`scan_carried`] does, and places nothing.
+///
+/// # Errors
+/// As [`scan_carried`].
+pub fn run_carried(
+    profilers: &mut [Profiling],
+    carrier: &mut Carrier,
+    watch: &mut dyn ScanWatch,
+) -> Result<CarriedRun, ScanError> {
     if profilers.is_empty() {
         return Err(ScanError::NoProfiler);
     }
-    let not_started = |device: &str, source| ScanError::Start {
-        device: device.to_owned(),
+    carrier.robot.start().map_err(|source| ScanError::Start {
+        device: carrier.name.clone(),
         source: Box::new(source),
-    };
-    carrier
-        .robot
-        .start()
-        .map_err(|source| not_started(&carrier.name, source))?;
-    for started in 0..profilers.len() {
-        let Err(source) = profilers[started].profiler.start() else {
-            continue;
-        };
-        profilers[..started].iter_mut().for_each(stop_after_failure);
+    })?;
+    if let Err(error) = start_all(profilers) {
         let _ = carrier.robot.stop();
-        return Err(not_started(&profilers[started].name, source));
+        return Err(error);
     }
     let began = Instant::now();
     let done: Vec<AtomicBool> = profilers.iter().map(|_| AtomicBool::new(false)).collect();
     let over = AtomicBool::new(false);
-    let (sender, receiver) = sync_channel(QUEUE_PROFILES);
     let (shares, share) = channel();
     let plan = carrier.plan;
     let (took, poses) = thread::scope(|scope| {
-        for (view, profiling) in profilers.iter_mut().enumerate() {
-            let (sender, done) = (sender.clone(), &done[view]);
-            scope.spawn(move || {
-                deliver(
-                    view,
-                    profiling.profiler.as_mut(),
-                    plan.silence,
-                    &sender,
-                    done,
-                );
-            });
-        }
-        drop(sender);
+        let receiver = deliver_all(scope, profilers, plan.silence, &done);
         let (robot, done, over_now) = (carrier.robot.as_mut(), &done, &over);
         let follower = scope.spawn(move || follow(robot, plan, &shares, done, over_now));
         let took = collect(&receiver, &share, done, watch);
@@ -135,8 +136,70 @@ pub fn scan_carried(
         lost(&profiling.name, took.error.as_ref(), watch);
     }
     lost(&carrier.name, poses.error.as_ref(), watch);
-    let scan = place(&profilers, took, carrier, &poses, began);
-    Ok((scan, profilers))
+    Ok(CarriedRun { took, poses, began })
+}
+
+impl CarriedRun {
+    /// Why the run is no whole one, in words; nothing where it is.
+    pub fn broken(&self, profilers: &[Profiling], carrier: &Carrier) -> Option<String> {
+        let (track, _) = self.track(carrier);
+        let of_profilers = profilers.iter().zip(&self.took).find_map(|(p, took)| {
+            let error = took.error.as_ref().map(|error| chain(error));
+            let silent = took.fell_silent.then(|| "it fell silent".to_owned());
+            Some(format!("{}: {}", p.name, error.or(silent)?))
+        });
+        let sound = self.poses.reached && self.poses.error.is_none();
+        of_profilers.or_else(|| match sound {
+            true => None,
+            false => Some(robot_findings(carrier, &self.poses, &track).swap_remove(0)),
+        })
+    }
+
+    /// The poses of the tool in the machine, by the robot's clock, and that clock.
+    fn track(&self, carrier: &Carrier) -> (PoseTrack, Option<ClockFit>) {
+        let poses = &self.poses.poses;
+        let received = poses.iter().map(|p| (p.device_time_s, p.host_time));
+        let clock = fit_clock(&receipts(received, self.began));
+        let mut track = PoseTrack::default();
+        for pose in poses {
+            let turn = DQuat::from_scaled_axis(pose.rotation.into());
+            let base_from_tool = RigidTransform::new(turn, pose.position_mm.into());
+            track.push(
+                pose.device_time_s,
+                carrier.plan.machine_from_base * base_from_tool,
+            );
+        }
+        (track, clock)
+    }
+
+    /// Times of a view's profiles by the robot's clock, no lag added; `None` where a clock is none.
+    fn times(&self, view: usize, robot_clock: Option<ClockFit>) -> Option<Vec<f64>> {
+        let profiles = &self.took[view].profiles;
+        let time_s = |profile: &Profile| profile.device_time_ns as f64 * 1e-9;
+        let received = profiles.iter().map(|p| (time_s(p), p.host_time));
+        let clock = fit_clock(&receipts(received, self.began))?;
+        let robot_clock = robot_clock?;
+        let times = profiles.iter().map(time_s);
+        Some(times.map(|t| robot_clock.device(clock.host(t))).collect())
+    }
+
+    /// What the profiler `view` saw, in the tool by the robot's clock, to find the lag with. `None` where a clock is none.
+    pub fn pass(&self, view: usize, profiling: &Profiling, carrier: &Carrier) -> Option<Pass> {
+        let (track, clock) = self.track(carrier);
+        let times = self.times(view, clock)?;
+        let tool_from_sensor = profiling.calibration.machine_from_sensor;
+        let profiles = self.took[view].profiles.iter().zip(times);
+        let seen = profiles.map(|(profile, time_s)| {
+            let columns = profile.x_mm.iter().zip(&profile.z_mm);
+            let seen = columns.filter(|(x, z)| x.is_finite() && z.is_finite());
+            let in_tool = seen.map(|(x, z)| tool_from_sensor.point(DVec3::new(*x, 0.0, *z)));
+            (time_s, in_tool.collect())
+        });
+        Some(Pass {
+            track,
+            profiles: seen.collect(),
+        })
+    }
 }
 
 fn lost(device: &str, error: Option<&DeviceError>, watch: &mut dyn ScanWatch) {
@@ -295,26 +358,12 @@ impl Unplaced {
     }
 }
 
-fn place(
-    profilers: &[Profiling],
-    took: Vec<Took>,
-    carrier: &Carrier,
-    poses: &Poses,
-    began: Instant,
-) -> Scan {
-    let robot_clock = fit_clock(&receipts(
-        poses.poses.iter().map(|p| (p.device_time_s, p.host_time)),
-        began,
-    ));
-    let mut track = PoseTrack::default();
-    for pose in &poses.poses {
-        let turn = DQuat::from_scaled_axis(pose.rotation.into());
-        let base_from_tool = RigidTransform::new(turn, pose.position_mm.into());
-        track.push(
-            pose.device_time_s,
-            carrier.plan.machine_from_base * base_from_tool,
-        );
-    }
+fn place(profilers: &[Profiling], run: CarriedRun, carrier: &Carrier) -> Scan {
+    let (track, robot_clock) = run.track(carrier);
+    let times: Vec<Option<Vec<f64>>> = (0..profilers.len())
+        .map(|view| run.times(view, robot_clock))
+        .collect();
+    let poses = &run.poses;
     let of_robot = robot_findings(carrier, poses, &track);
     let sound = poses.reached && poses.error.is_none();
     let mut cloud = PointCloud {
@@ -324,15 +373,9 @@ fn place(
         views: Vec::new(),
     };
     let mut views = Vec::new();
-    for (profiling, took) in profilers.iter().zip(took) {
-        let placed = place_view(
-            profiling,
-            &took.profiles,
-            carrier,
-            robot_clock,
-            &track,
-            began,
-        );
+    for ((profiling, took), times) in profilers.iter().zip(run.took).zip(times) {
+        let times = times.map(|times| times.iter().map(|t| t + carrier.plan.lag_s).collect());
+        let placed = place_view(profiling, &took.profiles, times, &track);
         let mut findings = if views.is_empty() {
             of_robot.clone()
         } else {
@@ -415,10 +458,8 @@ struct PlacedView {
 fn place_view(
     profiling: &Profiling,
     profiles: &[Profile],
-    carrier: &Carrier,
-    robot_clock: Option<ClockFit>,
+    times_s: Option<Vec<f64>>,
     track: &PoseTrack,
-    began: Instant,
 ) -> PlacedView {
     let tool_from_sensor = profiling.calibration.machine_from_sensor;
     let mut placed = PlacedView {
@@ -432,17 +473,8 @@ fn place_view(
         empty_columns: 0,
         profiles: 0,
     };
-    let time_s = |profile: &Profile| profile.device_time_ns as f64 * 1e-9;
-    let clock = fit_clock(&receipts(
-        profiles.iter().map(|p| (time_s(p), p.host_time)),
-        began,
-    ));
     let mut towards_sensor = DVec3::ZERO;
-    if let (Some(clock), Some(robot_clock)) = (clock, robot_clock) {
-        let times: Vec<f64> = profiles
-            .iter()
-            .map(|p| robot_clock.device(clock.host(time_s(p)) + carrier.plan.lag_s))
-            .collect();
+    if let Some(times) = times_s {
         for (profile, pose) in profiles.iter().zip(track.at(&times)) {
             match pose {
                 Ok(machine_from_tool) => {

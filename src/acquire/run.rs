@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::thread;
+use std::thread::{self, Scope};
 use std::time::{Duration, Instant};
 
 use acies_drivers::capture::Profile;
@@ -15,7 +15,7 @@ use crate::points::{Frame, PointCloud};
 
 /// Profiles that wait between a device and the assembly. When it is full the device's thread waits, the link pushes back,
 /// and what the device cannot keep it counts as dropped: nothing is lost silently.
-pub(super) const QUEUE_PROFILES: usize = 64;
+const QUEUE_PROFILES: usize = 64;
 
 /// How long one wait for a profile lasts before the thread looks whether it should stop.
 pub(super) const POLL: Duration = Duration::from_millis(50);
@@ -126,48 +126,52 @@ pub fn scan(
     if profilers.is_empty() {
         return Err(ScanError::NoProfiler);
     }
+    start_all(&mut profilers)?;
+    let mut views = Views::new(&profilers, plan);
+    let done: Vec<AtomicBool> = profilers.iter().map(|_| AtomicBool::new(false)).collect();
+    thread::scope(|scope| {
+        let receiver = deliver_all(scope, &mut profilers, plan.silence, &done);
+        views.collect(&receiver, &done, watch);
+    });
+    Ok((views.finish(&profilers), profilers))
+}
+
+/// Starts every profiler; where one does not start, those that did are stopped.
+pub(super) fn start_all(profilers: &mut [Profiling]) -> Result<(), ScanError> {
     for started in 0..profilers.len() {
         let Err(source) = profilers[started].profiler.start() else {
             continue;
         };
         for other in &mut profilers[..started] {
-            stop_after_failure(other);
+            if let Err(error) = other.profiler.stop() {
+                tracing::warn!(device = other.name, %error, "did not confirm its stop; its laser goes off by its own keep-alive");
+            }
         }
         return Err(ScanError::Start {
             device: profilers[started].name.clone(),
             source: Box::new(source),
         });
     }
-    let done: Vec<AtomicBool> = profilers.iter().map(|_| AtomicBool::new(false)).collect();
-    let (sender, receiver) = sync_channel(QUEUE_PROFILES);
-    let mut views = Views::new(&profilers, plan);
-    thread::scope(|scope| {
-        for (view, profiling) in profilers.iter_mut().enumerate() {
-            let (sender, done) = (sender.clone(), &done[view]);
-            scope.spawn(move || {
-                deliver(
-                    view,
-                    profiling.profiler.as_mut(),
-                    plan.silence,
-                    &sender,
-                    done,
-                )
-            });
-        }
-        drop(sender);
-        views.collect(&receiver, &done, watch);
-    });
-    Ok((views.finish(&profilers), profilers))
+    Ok(())
 }
 
-pub(super) fn stop_after_failure(profiling: &mut Profiling) {
-    if let Err(error) = profiling.profiler.stop() {
-        tracing::warn!(device = profiling.name, %error, "did not confirm its stop; its laser goes off by its own keep-alive");
+/// A thread for every profiler that was started; what they send comes together here, until each has ended.
+pub(super) fn deliver_all<'scope, 'env>(
+    scope: &'scope Scope<'scope, 'env>,
+    profilers: &'env mut [Profiling],
+    silence: Duration,
+    done: &'env [AtomicBool],
+) -> Receiver<Message> {
+    let (sender, receiver) = sync_channel(QUEUE_PROFILES);
+    for (view, (profiling, done)) in profilers.iter_mut().zip(done).enumerate() {
+        let sender = sender.clone();
+        scope.spawn(move || deliver(view, profiling.profiler.as_mut(), silence, &sender, done));
     }
+    receiver
 }
 
 /// Reads one device until it is told that the view is done, it falls silent, or it is gone.
-pub(super) fn deliver(
+fn deliver(
     view: usize,
     profiler: &mut dyn Profiler,
     silence: Duration,

@@ -1,9 +1,11 @@
-//! `acies calibrate CELL.toml`: a profiler's pose and travel from recordings of a reference sphere.
+//! `acies calibrate CELL.toml`: a profiler's pose and travel from recordings of a reference sphere, or the lag of a robot that carries it.
 
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use acies_drivers::device::{Identity, Instrument};
+use acies_drivers::error::DeviceError;
+use acies_drivers::link::cable::Cable;
 use acies_drivers::link::recording::Recording;
 use acies_drivers::link::replay::{Match, Replay};
 use anyhow::anyhow;
@@ -13,11 +15,19 @@ use serde_json::json;
 use super::attached_device::{Configured, find, open, read_cell, run};
 use super::{Failure, Status, print_line};
 use crate::acquire::calibrate::{ProfilerCalibration, SphereScan, calibrate_profiler};
+use crate::acquire::lag::{Artefact, Lag, find_lag};
+use crate::acquire::{Carrier, Profiling, ScanEvent, run_carried};
+use crate::config::Cell;
 
 /// Finds where a profiler stands and how the stage runs, from recordings of a reference sphere at known places.
 ///
 /// Three places, not on one line, hold everything. Prints the table for the cell's configuration, with date, residuals and standard
 /// uncertainties; `--json` prints the whole covariance.
+///
+/// With `--lag` it finds the lag between a robot's poses and a profiler on it instead, with the devices of the cell: so many times the
+/// robot's program goes over a sphere of about `--radius`, or without it over a plate inclined to the path, and back; a pass is over where
+/// a scan is (`end_mm` of the robot), so that end and start are one place. Of several passes the scatter of the clocks is in the
+/// uncertainty too.
 #[derive(Debug, clap::Args)]
 pub struct Calibrate {
     /// The cell's configuration; its present calibration is the start.
@@ -26,11 +36,14 @@ pub struct Calibrate {
     #[arg(long, value_name = "NAME")]
     device: Option<String>,
     /// A recording of the sphere and the sphere's centre in the machine, mm: "sphere-0.aciesrec=120.5,30.1,42.0". Several times.
-    #[arg(long, value_name = "RECORDING=X,Y,Z", required = true)]
+    #[arg(long, value_name = "RECORDING=X,Y,Z", required_unless_present = "lag")]
     sphere: Vec<String>,
-    /// Certified radius of the sphere, mm.
-    #[arg(long, value_name = "MM")]
-    radius: f64,
+    /// Radius of the sphere, mm: certified for a pose, about right for a lag.
+    #[arg(long, value_name = "MM", required_unless_present = "lag")]
+    radius: Option<f64>,
+    /// Find the lag of the cell's robot from so many passes to and fro.
+    #[arg(long, value_name = "PASSES", conflicts_with = "sphere", value_parser = clap::value_parser!(u32).range(1..=100))]
+    lag: Option<u32>,
     /// Standard uncertainty of each coordinate of a centre, mm.
     #[arg(long, value_name = "MM", default_value_t = 0.002)]
     u_centre: f64,
@@ -49,12 +62,16 @@ impl Calibrate {
     /// Bad input where configuration, recordings or places cannot be understood or do not hold the calibration.
     pub fn run(self) -> Result<Status, Failure> {
         let cell = read_cell(&self.cell)?;
+        if let Some(passes) = self.lag {
+            return self.find_lag(&cell, passes);
+        }
         let device = find(&cell, self.device.as_deref())?;
         let rough = device
             .calibration
             .ok_or_else(|| Failure::Usage(anyhow!("--device: a probe, expected a profiler")))?;
         let positive = |value: f64| value.is_finite() && value > 0.0;
-        if !positive(self.radius) || !positive(self.u_centre) || !positive(self.noise) {
+        let radius_mm = self.radius.unwrap_or(f64::NAN);
+        if !positive(radius_mm) || !positive(self.u_centre) || !positive(self.noise) {
             return Err(Failure::Usage(anyhow!(
                 "--radius, --u-centre and --noise: expected numbers above 0"
             )));
@@ -69,7 +86,7 @@ impl Calibrate {
                 profiles,
                 centre_mm,
                 u_centre_mm: self.u_centre,
-                radius_mm: self.radius,
+                radius_mm,
             });
         }
         let found = calibrate_profiler(&scans, &rough, self.noise)
@@ -82,6 +99,122 @@ impl Calibrate {
         })?;
         Ok(Status::Done)
     }
+}
+
+impl Calibrate {
+    fn find_lag(&self, cell: &Cell, passes: u32) -> Result<Status, Failure> {
+        let artefact = match self.radius {
+            None => Artefact::Plate,
+            Some(radius_mm) if radius_mm.is_finite() && radius_mm > 0.0 => {
+                Artefact::Sphere { radius_mm }
+            }
+            Some(_) => {
+                return Err(Failure::Usage(anyhow!(
+                    "--radius: expected a number above 0"
+                )));
+            }
+        };
+        let config = cell.carrier.as_ref().ok_or_else(|| {
+            Failure::BadInput(anyhow!(
+                "the cell has no robot: no device with [device.carrier]"
+            ))
+        })?;
+        let named = |name: &str| self.device.as_deref().is_none_or(|wanted| wanted == name);
+        let of_name: Vec<_> = cell.profilers.iter().filter(|p| named(&p.name)).collect();
+        let [profiler] = of_name[..] else {
+            let names: Vec<String> = cell
+                .profilers
+                .iter()
+                .map(|p| format!("{:?}", p.name))
+                .collect();
+            return Err(Failure::Usage(anyhow!(
+                "--device: expected one of {}",
+                names.join(", ")
+            )));
+        };
+        let io = |error: DeviceError| Failure::Io(error.into());
+        let Instrument::Robot(robot) = config.setup.open(&Cable).map_err(io)? else {
+            return Err(Failure::BadInput(anyhow!(
+                "{}: expected a robot",
+                config.name
+            )));
+        };
+        let Instrument::Profiler(line) = profiler.setup.open(&Cable).map_err(io)? else {
+            return Err(Failure::BadInput(anyhow!(
+                "{}: expected a profiler",
+                profiler.name
+            )));
+        };
+        let mut carrier = Carrier {
+            name: config.name.clone(),
+            robot,
+            plan: config.plan,
+        };
+        let mut profilers = [Profiling {
+            name: profiler.name.clone(),
+            profiler: line,
+            calibration: profiler.calibration,
+        }];
+        let mut taken = Vec::new();
+        for number in 1..=passes {
+            eprintln!("pass {number} of {passes}: start the robot's program");
+            let run = run_carried(&mut profilers, &mut carrier, &mut |_: ScanEvent| {})
+                .map_err(|error| Failure::Io(error.into()))?;
+            if let Some(why) = run.broken(&profilers, &carrier) {
+                return Err(Failure::Io(anyhow!("pass {number}: {why}")));
+            }
+            let pass = run.pass(0, &profilers[0], &carrier);
+            taken.push(pass.ok_or_else(|| {
+                Failure::BadInput(anyhow!(
+                    "pass {number}: a device's times are no clock; check that its clock is on"
+                ))
+            })?);
+        }
+        let lag = find_lag(&taken, artefact).map_err(|error| Failure::BadInput(error.into()))?;
+        print_line(&if self.json {
+            lag_as_json(&lag, &profiler.name).to_string()
+        } else {
+            lag_as_toml(&lag)
+        })?;
+        Ok(Status::Done)
+    }
+}
+
+fn lag_as_toml(lag: &Lag) -> String {
+    let passes = lag.passes.iter().map(|(lag_s, u_s)| {
+        format!(
+            "#   {:+.3} ms, standard uncertainty of the fit {:.3} ms\n",
+            1e3 * lag_s,
+            1e3 * u_s
+        )
+    });
+    let alone = match lag.passes.len() {
+        1 => "# one pass: what the clocks differ by from run to run is not in it\n",
+        _ => "",
+    };
+    format!(
+        "# residuals: rms {:.2} um; passes:\n{}# standard uncertainty {:.3} ms\n{alone}[device.carrier]\nlag_s = {:.6}",
+        1e3 * lag.rms_mm,
+        passes.collect::<String>(),
+        1e3 * lag.u_s,
+        lag.lag_s
+    )
+}
+
+fn lag_as_json(lag: &Lag, device: &str) -> serde_json::Value {
+    let passes: Vec<_> = lag
+        .passes
+        .iter()
+        .map(|(lag_s, u_s)| json!({"lag_s": lag_s, "u_fit_s": u_s}))
+        .collect();
+    json!({
+        "schema": "acies-lag/1",
+        "device": device,
+        "lag_s": lag.lag_s,
+        "u_s": lag.u_s,
+        "rms_mm": lag.rms_mm,
+        "passes": passes,
+    })
 }
 
 fn parse_sphere(text: &str) -> Result<(PathBuf, DVec3), Failure> {

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::{Duration, Instant};
 
-use acies_drivers::device::Instrument;
+use acies_drivers::device::{Instrument, Presence};
 use acies_drivers::error::{DeviceError, LinkError};
 use acies_drivers::link::cable::Cable;
 use acies_drivers::link::{Link, Links, Target};
@@ -145,6 +145,51 @@ fn all_at_once(each: impl Fn(Bench) + Sync) {
             scope.spawn(|| each(bench));
         }
     });
+}
+
+/// An idle device is asked, and a pulled plug shows. It is never lit by that, and works afterwards.
+#[test]
+fn each_says_whether_its_idle_device_is_there() {
+    let cell = cell(1, "");
+    for bench in benches() {
+        let (device, link) = bench.plug(&cell, "check");
+        let setup = bench.setup(&link, "");
+        let mut instrument = open(&*setup, &Cable);
+        for _ in 0..3 {
+            let found = instrument.check();
+            assert_eq!(found.ok(), Some(Presence::Answered), "{}", bench.name);
+            assert!(device.laser_on() != Some(true) || !bench.laser);
+        }
+        begin(&mut instrument);
+        if let Instrument::Profiler(profiler) = &mut instrument {
+            let told = profiler.check().map_err(|error| text(&error));
+            let end = "check needs the run to be stopped: a device that streams is there";
+            assert!(
+                told.is_err_and(|told| told.ends_with(end)),
+                "{}",
+                bench.name
+            );
+            if let Err(error) = profiler.stop() {
+                panic!("{}: {}", bench.name, text(&error));
+            }
+        }
+        let worked = work(&mut instrument, &cell);
+        assert!(worked.is_ok(), "{}: after a check", bench.name);
+        assert_eq!(instrument.check().ok(), Some(Presence::Answered));
+        device.unplug();
+        let deadline = Instant::now() + SOON;
+        let error = loop {
+            match instrument.check() {
+                Ok(_) => assert!(Instant::now() < deadline, "{}: nobody noticed", bench.name),
+                Err(error) => break error,
+            }
+        };
+        assert!(
+            error.may_pass() && text(&error).ends_with(GONE),
+            "{}",
+            text(&error)
+        );
+    }
 }
 
 // ---- A line that is not as it should be -------------------------------------------------------------------------------

@@ -226,36 +226,35 @@ impl Profiles<'_> {
     pub fn points_mm(&self, index: usize) -> (Vec<f64>, Vec<f64>) {
         let [xs, zs] = [self.x_scale_nm, self.z_scale_nm].map(|nm| f64::from(nm) * 1e-6);
         let [x0, z0] = [self.x_offset_um, self.z_offset_um].map(|um| f64::from(um) * 1e-3);
-        let z_of = |raw: i16| match raw {
-            INVALID => f64::NAN,
-            raw => z0 + f64::from(raw) * zs,
+        let z_of = |[low, high]: &[u8; 2]| {
+            let raw = i16::from_le_bytes([*low, *high]);
+            let z = z0 + f64::from(raw) * zs;
+            if raw == INVALID { f64::NAN } else { z }
         };
         match self.form {
             Form::Uniform => {
                 let row = self.row(index, 2 * self.width);
                 let x = (0..self.width).map(|i| x0 + i as f64 * xs).collect();
-                let z = row
-                    .chunks_exact(2)
-                    .map(|b| z_of(i16::from_le_bytes([b[0], b[1]])))
-                    .collect();
-                (x, z)
+                (x, row.as_chunks::<2>().0.iter().map(z_of).collect())
             }
             Form::PointCloud => {
-                let row = self.row(index, 4 * self.width);
+                let row = self.row(index, 4 * self.width).as_chunks::<4>().0;
                 let mut last = x0;
-                row.chunks_exact(4)
-                    .map(|b| {
-                        let (x, z) = (
-                            i16::from_le_bytes([b[0], b[1]]),
-                            i16::from_le_bytes([b[2], b[3]]),
-                        );
-                        if x == INVALID || z == INVALID {
-                            return (last, f64::NAN);
-                        }
-                        last = x0 + f64::from(x) * xs;
-                        (last, z_of(z))
-                    })
-                    .unzip()
+                // Filled in place: two growing lists cost more than the arithmetic.
+                let (mut xs_mm, mut zs_mm) = (vec![0.0; row.len()], vec![0.0; row.len()]);
+                for ((point, x_mm), z_mm) in row.iter().zip(&mut xs_mm).zip(&mut zs_mm) {
+                    let x = i16::from_le_bytes([point[0], point[1]]);
+                    let z = i16::from_le_bytes([point[2], point[3]]);
+                    let seen = x != INVALID && z != INVALID;
+                    last = if seen { x0 + f64::from(x) * xs } else { last };
+                    *x_mm = last;
+                    *z_mm = if seen {
+                        z0 + f64::from(z) * zs
+                    } else {
+                        f64::NAN
+                    };
+                }
+                (xs_mm, zs_mm)
             }
         }
     }

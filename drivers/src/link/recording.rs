@@ -27,7 +27,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use super::usb::{self, Request, UsbInterface, UsbLink, UsbTarget};
+use super::usb::{self, Request, UsbInterface, UsbLink, UsbStream, UsbTarget};
 use super::{Link, Links, Target};
 use crate::error::LinkError;
 
@@ -637,7 +637,38 @@ impl UsbLink for RecordedUsb {
         answer
     }
 
+    fn stream(
+        &self,
+        endpoint: u8,
+        transfers: usize,
+        bytes: usize,
+    ) -> Result<Box<dyn UsbStream + '_>, LinkError> {
+        Ok(Box::new(RecordedStream {
+            stream: self.link.stream(endpoint, transfers, bytes)?,
+            usb: self,
+            channel: self.channel_of(endpoint),
+        }))
+    }
+
     fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError> {
         self.link.clear_halt(endpoint)
+    }
+}
+
+struct RecordedStream<'a> {
+    stream: Box<dyn UsbStream + 'a>,
+    usb: &'a RecordedUsb,
+    channel: u8,
+}
+
+impl UsbStream for RecordedStream<'_> {
+    fn next(&mut self, deadline: Instant) -> Result<Option<&[u8]>, LinkError> {
+        let answer = self.stream.next(deadline);
+        match &answer {
+            Ok(Some(bytes)) => self.usb.tape.put(Kind::FromDevice, self.channel, bytes),
+            Ok(None) => {}
+            Err(error) => self.usb.note_failure(self.channel, error),
+        }
+        answer
     }
 }

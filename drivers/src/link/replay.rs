@@ -8,7 +8,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::recording::{Kind, Record, Recording};
-use super::usb::{self, Request, UsbInterface, UsbLink, UsbTarget};
+use super::usb::{self, OneByOne, Request, UsbInterface, UsbLink, UsbStream, UsbTarget};
 use super::{Link, Links, Target, left};
 use crate::error::LinkError;
 
@@ -399,6 +399,15 @@ impl UsbLink for PlayedUsb {
 
     fn write(&self, endpoint: u8, bytes: &[u8], _: Instant) -> Result<Option<usize>, LinkError> {
         self.send(self.channel_of(endpoint), bytes, bytes.len())
+    }
+
+    fn stream(
+        &self,
+        endpoint: u8,
+        _: usize,
+        bytes: usize,
+    ) -> Result<Box<dyn UsbStream + '_>, LinkError> {
+        Ok(Box::new(OneByOne::new(self, endpoint, bytes)))
     }
 
     fn clear_halt(&self, _: u8) -> Result<(), LinkError> {

@@ -4,14 +4,14 @@
 //! device that was plugged in again where no udev runs. Where libusb cannot start (no USB in the kernel, no /dev/bus/usb in a container) that is
 //! an error of the opening, tried again like any other.
 //!
-//! A read is one transfer into one buffer. libusb cuts it into pieces of 16 KiB or more that are all queued in the kernel at once, so that a large read
-//! keeps several in flight; between two reads the device holds what it has, and
-//! how long a real one must hold it has not been measured.
+//! A read is one transfer into one buffer; between two reads nothing is queued, and the device holds what it has. [`UsbLink::stream`] keeps several
+//! transfers in flight, so that a device with little memory loses nothing.
 
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use acies_usb_queue::Queue;
 use rusb::UsbContext;
 
 use super::left;
@@ -209,11 +209,55 @@ pub trait UsbLink: Send + Sync {
         bytes: &[u8],
         deadline: Instant,
     ) -> Result<Option<usize>, LinkError>;
-    /// Ends a stall of an endpoint.
+    /// Transfers from a bulk endpoint one after the other, each of at most `bytes`, with so many in flight at once where the link can.
+    ///
+    /// # Errors
+    /// [`LinkError::Io`] where there is no memory for the buffers.
+    fn stream(
+        &self,
+        endpoint: u8,
+        transfers: usize,
+        bytes: usize,
+    ) -> Result<Box<dyn UsbStream + '_>, LinkError>;
+    /// Ends a stall of an endpoint. Nothing may be in flight on it.
     ///
     /// # Errors
     /// [`LinkError::Gone`] when the device is not there any more.
     fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError>;
+}
+
+/// Transfers that come from an endpoint; those in flight are ended when it is dropped, and what they had read is lost.
+pub trait UsbStream {
+    /// The bytes of the next transfer, as of [`UsbLink::read`].
+    ///
+    /// # Errors
+    /// As [`UsbLink::read`]; after an error nothing is in flight until the next call.
+    fn next(&mut self, deadline: Instant) -> Result<Option<&[u8]>, LinkError>;
+}
+
+/// A stream of a link that has one transfer in flight at a time.
+pub struct OneByOne<'a> {
+    link: &'a dyn UsbLink,
+    endpoint: u8,
+    buffer: Vec<u8>,
+}
+
+impl<'a> OneByOne<'a> {
+    /// Of transfers of at most so many bytes.
+    pub fn new(link: &'a dyn UsbLink, endpoint: u8, bytes: usize) -> OneByOne<'a> {
+        OneByOne {
+            link,
+            endpoint,
+            buffer: vec![0; bytes],
+        }
+    }
+}
+
+impl UsbStream for OneByOne<'_> {
+    fn next(&mut self, deadline: Instant) -> Result<Option<&[u8]>, LinkError> {
+        let n = self.link.read(self.endpoint, &mut self.buffer, deadline)?;
+        Ok(n.map(|n| &self.buffer[..n]))
+    }
 }
 
 /// The rule that lets a user at this computer open such a device, and the file it belongs in.
@@ -230,6 +274,8 @@ pub fn udev_rule(vendor: u16, product: u16) -> (&'static str, String) {
 const LEAST_WAIT: Duration = Duration::from_millis(1);
 /// Most bytes of a configuration descriptor with all that belongs to it.
 const CONFIGURATION_MAX: usize = 4096;
+/// What failed, in errors of a stream.
+const STREAMING: &str = "reading its stream";
 /// How long descriptors are waited for.
 const DESCRIPTORS: Duration = Duration::from_secs(1);
 
@@ -448,10 +494,33 @@ impl UsbLink for Device {
         )
     }
 
+    fn stream(
+        &self,
+        endpoint: u8,
+        transfers: usize,
+        bytes: usize,
+    ) -> Result<Box<dyn UsbStream + '_>, LinkError> {
+        let queue = Queue::new(&self.handle, endpoint, transfers, bytes);
+        let queue = queue.map_err(|error| failure(error, STREAMING).unwrap_or(LinkError::Gone))?;
+        Ok(Box::new(Queued(queue)))
+    }
+
     fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError> {
         self.handle
             .clear_halt(endpoint)
             .map_err(|error| failure(error, "clearing a stall").unwrap_or(LinkError::Gone))
+    }
+}
+
+/// Transfers in flight over libusb.
+struct Queued<'a>(Queue<'a>);
+
+impl UsbStream for Queued<'_> {
+    fn next(&mut self, deadline: Instant) -> Result<Option<&[u8]>, LinkError> {
+        match self.0.next(deadline) {
+            Ok(bytes) => Ok(bytes),
+            Err(error) => failure(error, STREAMING).map_or(Ok(None), Err),
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Bytes of the bus to answers, and the two bits that count them. Pure; at most one answer is held.
+//! Bytes of the bus to answers. Pure; at most one answer is held.
 //!
 //! Every byte of an answer has bit 7, the same SB and the same CNT. There is no length and no check: an answer is as many equal
 //! upper halves in a row as the request is known to bring.
@@ -94,49 +94,6 @@ impl Decoder {
     }
 }
 
-/// Numbers the bursts of a stream by their two bits.
-///
-/// Two bits say how many are missing only up to a multiple of 4. The bytes thrown away in between tell which: a burst has four.
-/// We differ from a count by time: bytes may wait anywhere between the sensor and here, but they do not multiply.
-#[derive(Debug, Default)]
-pub struct Count {
-    next: Option<(u8, u64)>,
-    /// The counter may have gone on unseen.
-    unknown: bool,
-    skipped_at_last: u64,
-    /// Bursts missing between those that came.
-    pub lost: u64,
-}
-
-impl Count {
-    /// A stream begins, or begins again: its counter stands anywhere, and what was thrown away before says nothing of it.
-    pub fn begin(&mut self, skipped_bytes: u64) {
-        self.unknown = true;
-        self.skipped_at_last = skipped_bytes;
-    }
-
-    /// The number of a burst, from 0, by its CNT and the bytes thrown away so far.
-    pub fn number(&mut self, counter: u8, skipped_bytes: u64) -> u64 {
-        let skipped = skipped_bytes - self.skipped_at_last;
-        self.skipped_at_last = skipped_bytes;
-        let number = match self.next {
-            None => 0,
-            Some((_, next)) if self.unknown => next,
-            Some((expected, next)) => {
-                let least = u64::from(counter.wrapping_sub(expected) & 3);
-                // The number of the form least + 4 k nearest to a quarter of the bytes.
-                let turns = (skipped + 8).saturating_sub(4 * least) / 16;
-                let missing = least + 4 * turns;
-                self.lost += missing;
-                next + missing
-            }
-        };
-        self.unknown = false;
-        self.next = Some(((counter + 1) & 3, number + 1));
-        number
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
@@ -178,66 +135,6 @@ mod tests {
         assert_eq!((full[1].word(0), full[1].counter), (Some(0x2000), 1));
     }
 
-    /// A stream of bursts with value = number.
-    fn stream(n: u16) -> Vec<u8> {
-        let burst = |k: u16| {
-            let top = 0xC0 | (k as u8 & 3) << 4;
-            [0, 4, 8, 12].map(|shift| top | (k >> shift) as u8 & 15)
-        };
-        (0..n).flat_map(burst).collect()
-    }
-
-    #[test]
-    fn a_lost_nibble_costs_its_burst_and_no_other() {
-        let bytes = stream(12);
-        for lost in 4..bytes.len() - 4 {
-            let mut damaged = bytes.clone();
-            damaged.remove(lost);
-            let found = numbered(&damaged);
-            assert_eq!(found.len(), 11);
-            assert!(
-                found.iter().all(|(number, value)| number == value),
-                "{found:?}"
-            );
-        }
-    }
-
-    /// Numbers and values of a stream.
-    fn numbered(bytes: &[u8]) -> Vec<(u64, u64)> {
-        let mut decoder = Decoder::default();
-        decoder.expect(2);
-        let mut count = Count::default();
-        let mut found = Vec::new();
-        decoder.take(bytes, |answer, skipped| {
-            let number = count.number(answer.counter, skipped);
-            found.push((number, answer.word(0).unwrap_or(0).into()));
-        });
-        found
-    }
-
-    #[test]
-    fn many_bursts_of_rubbish_are_counted_by_their_bytes() {
-        for (from, length) in [
-            (8, 62),
-            (9, 62),
-            (10, 62),
-            (11, 62),
-            (17, 124),
-            (4, 16),
-            (5, 3),
-        ] {
-            let mut bytes = stream(60);
-            bytes[from..from + length].fill(0);
-            let found = numbered(&bytes);
-            assert!(
-                found.iter().all(|(number, value)| number == value),
-                "{from} {length}"
-            );
-            let whole = 60 - (from + length).div_ceil(4) + from / 4;
-            assert_eq!(found.len(), whole);
-        }
-    }
-
     proptest! {
         #![proptest_config(ProptestConfig {
             rng_seed: RngSeed::Fixed(7),
@@ -251,12 +148,8 @@ mod tests {
         ) {
             let mut decoder = Decoder::default();
             decoder.expect(payload);
-            let mut count = Count::default();
             let mut used = 0;
-            decoder.take(&bytes, |answer, skipped| {
-                used += 2 * answer.payload().len() as u64;
-                count.number(answer.counter, skipped);
-            });
+            decoder.take(&bytes, |answer, _| used += 2 * answer.payload().len() as u64);
             prop_assert!(decoder.held_bytes() < ANSWER_MAX);
             let all = used + decoder.skipped_bytes() + decoder.held_bytes() as u64;
             prop_assert_eq!(all, bytes.len() as u64);

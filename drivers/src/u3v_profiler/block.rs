@@ -253,43 +253,58 @@ pub fn points_mm(
     geometry: &Geometry,
     x_offset: u32,
 ) -> (Vec<f64>, Vec<f64>) {
-    let columns = line.len() / pixel.bytes();
+    // A number that nothing equals, where the device has none that means "nothing".
+    let invalid = geometry.invalid.unwrap_or(f64::NAN);
     let z_of = |raw: f64| {
-        let unseen = geometry.invalid == Some(raw) || !raw.is_finite();
-        if unseen {
-            f64::NAN
-        } else {
-            raw * geometry.c_scale + geometry.c_offset
+        let z = raw * geometry.c_scale + geometry.c_offset;
+        match raw == invalid || !raw.is_finite() {
+            true => f64::NAN,
+            false => z,
         }
     };
-    let value = |pixel_bytes: &[u8], place: usize| match pixel.float {
-        true => u32_at(pixel_bytes, 4 * place).map_or(f64::NAN, |raw| f32::from_bits(raw).into()),
-        false => u16_at(pixel_bytes, 2 * place).map_or(f64::NAN, f64::from),
-    };
+    match pixel.float {
+        true => {
+            let of = |bytes: &[u8; 4]| f32::from_le_bytes(*bytes).into();
+            points_of(line.as_chunks::<4>().0, of, pixel, geometry, x_offset, z_of)
+        }
+        false => {
+            let of = |bytes: &[u8; 2]| u16::from_le_bytes(*bytes).into();
+            points_of(line.as_chunks::<2>().0, of, pixel, geometry, x_offset, z_of)
+        }
+    }
+}
+
+/// [`points_mm`] for numbers of one kind.
+fn points_of<N>(
+    numbers: &[N],
+    of: impl Fn(&N) -> f64,
+    pixel: Pixel,
+    geometry: &Geometry,
+    x_offset: u32,
+    z_of: impl Fn(f64) -> f64,
+) -> (Vec<f64>, Vec<f64>) {
+    let x_of = |raw: f64| raw * geometry.a_scale + geometry.a_offset;
     let Some(a) = pixel.a else {
-        let x = |i: usize| (i as f64 + f64::from(x_offset)) * geometry.a_scale + geometry.a_offset;
-        let z = match pixel.float {
-            false => line
-                .chunks_exact(2)
-                .map(|b| z_of(u16::from_le_bytes([b[0], b[1]]).into()))
-                .collect(),
-            true => line.chunks_exact(4).map(|b| z_of(value(b, 0))).collect(),
-        };
-        return ((0..columns).map(x).collect(), z);
+        let x = |i: usize| x_of(i as f64 + f64::from(x_offset));
+        let z = numbers.iter().map(|number| z_of(of(number)));
+        return ((0..numbers.len()).map(x).collect(), z.collect());
     };
+    let pixels = numbers.chunks_exact(pixel.bytes() / size_of::<N>());
     let mut last = geometry.a_offset;
-    line.chunks_exact(pixel.bytes())
-        .map(|bytes| {
-            let z = z_of(value(bytes, pixel.c));
-            let x = value(bytes, a) * geometry.a_scale + geometry.a_offset;
-            if x.is_finite() {
-                last = x;
-                (x, z)
-            } else {
-                (last, f64::NAN)
-            }
-        })
-        .unzip()
+    // Filled in place: two growing lists cost more than the arithmetic.
+    let (mut xs_mm, mut zs_mm) = (vec![0.0; pixels.len()], vec![0.0; pixels.len()]);
+    for ((numbers, x_mm), z_mm) in pixels.zip(&mut xs_mm).zip(&mut zs_mm) {
+        let x = x_of(of(&numbers[a]));
+        let seen = x.is_finite();
+        last = if seen { x } else { last };
+        *x_mm = last;
+        *z_mm = if seen {
+            z_of(of(&numbers[pixel.c]))
+        } else {
+            f64::NAN
+        };
+    }
+    (xs_mm, zs_mm)
 }
 
 /// The lines of an image, each without its padding.

@@ -295,6 +295,12 @@ fn unzip(archive: &[u8]) -> Option<Vec<u8>> {
 }
 
 impl Register {
+    /// Bits of the number.
+    pub fn width(&self) -> u32 {
+        let all = 8 * self.length.min(8) as u32;
+        self.bits.map_or(all, |(low, high)| high - low + 1)
+    }
+
     /// The integer in the register's bytes.
     pub fn integer(&self, bytes: &[u8]) -> i64 {
         let mut value = 0_u64;

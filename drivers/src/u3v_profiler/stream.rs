@@ -15,6 +15,10 @@ use crate::link::usb::UsbLink;
 
 /// Most bytes of profiles that wait for the caller.
 const QUEUE_BYTES: usize = 64 << 20;
+/// Bytes of all transfers in flight: half of what Linux lets wait.
+const IN_FLIGHT_BYTES: usize = 8 << 20;
+/// Most transfers in flight.
+const IN_FLIGHT_MAX: usize = 32;
 /// Longest wait in one read.
 const SLICE: Duration = Duration::from_millis(100);
 /// Stalls without a block between them after which the stream is given up.
@@ -117,11 +121,6 @@ impl Shared {
         let waited = self.arrived.wait_timeout(inbox, wait);
         waited.unwrap_or_else(PoisonError::into_inner).0
     }
-
-    fn end(&self, over: Over) {
-        self.lock().over.get_or_insert(over);
-        self.arrived.notify_all();
-    }
 }
 
 impl Inbox {
@@ -203,6 +202,7 @@ pub(super) fn profiles(
     trailer: &Trailer,
     payload: &[u8],
     reading: &Reading,
+    wraps: &mut Wraps,
     host_time: Instant,
 ) -> Result<Vec<Profile>, DecodeError> {
     let valid = usize::try_from(trailer.valid_payload).unwrap_or(usize::MAX);
@@ -229,7 +229,10 @@ pub(super) fn profiles(
         let bytes = chunk.data.get(from..from.checked_add(register.length)?)?;
         Some(register.integer(bytes))
     };
-    let encoder = value(reading.encoder);
+    let encoder = value(reading.encoder).map(|counts| match reading.encoder {
+        Some(register) => wraps.whole(counts, register.width()),
+        None => counts,
+    });
     let time = value(reading.time).map_or(leader.timestamp_ns, |time| time as u64);
     let height = trailer.height.unwrap_or(leader.height).min(leader.height);
     let lines = block::lines(image, leader, height, pixel)?;
@@ -258,6 +261,25 @@ pub(super) fn profiles(
             }
         })
         .collect())
+}
+
+/// A counter of a few bits, made whole: it is believed to have gone the shorter way round since it was seen last.
+#[derive(Debug, Default)]
+pub(super) struct Wraps(Option<i64>);
+
+impl Wraps {
+    fn whole(&mut self, counts: i64, bits: u32) -> i64 {
+        let whole = match self.0 {
+            Some(last) if bits < 64 => {
+                let shift = 64 - bits;
+                let step = counts.wrapping_sub(last) << shift >> shift;
+                last.wrapping_add(step)
+            }
+            _ => counts,
+        };
+        self.0 = Some(whole);
+        whole
+    }
 }
 
 /// Reads blocks from transfers, whatever is missing between them.
@@ -345,84 +367,115 @@ impl Blocks {
     }
 }
 
+/// Transfers in flight for buffers of so many bytes.
+fn in_flight(bytes: usize) -> usize {
+    (IN_FLIGHT_BYTES / bytes.max(1)).clamp(2, IN_FLIGHT_MAX)
+}
+
 /// Runs the thread until the caller wants it to end or nothing more will come.
 pub(super) fn run(link: &Arc<dyn UsbLink>, shared: &Shared, reading: &Reading) {
+    if let Err(over) = read_blocks(link.as_ref(), shared, reading) {
+        shared.lock().over.get_or_insert(over);
+        shared.arrived.notify_all();
+    }
+}
+
+fn read_blocks(link: &dyn UsbLink, shared: &Shared, reading: &Reading) -> Result<(), Over> {
     let mut blocks = Blocks::new();
     let size = reading
         .transfer
         .max(reading.leader_max)
         .max(reading.trailer_max);
-    let mut buffer = vec![0; size];
+    let gone = |error| Over::Link(Some(error));
+    // While a run is on: a device that stands still has nothing to fill.
+    let mut stream = None;
     let mut stalls = 0;
+    let mut wraps = Wraps::default();
     loop {
         let inbox = shared.lock();
         if inbox.quit || inbox.over.is_some() {
-            return;
+            return Ok(());
         }
-        if inbox.full() || !inbox.running {
+        let running = inbox.running;
+        if running && inbox.full() || !running && stream.is_none() {
             drop(shared.taken.wait_timeout(inbox, SLICE));
             continue;
         }
         drop(inbox);
-        let n = match link.read(reading.endpoint, &mut buffer, Instant::now() + SLICE) {
-            Ok(None | Some(0)) => continue,
-            Ok(Some(n)) => n,
+        if !running {
+            stream = None;
+            continue;
+        }
+        let reads = match &mut stream {
+            Some(reads) => reads,
+            none => {
+                let opened = link.stream(reading.endpoint, in_flight(size), size);
+                none.insert(opened.map_err(gone)?)
+            }
+        };
+        let bytes = match reads.next(Instant::now() + SLICE) {
+            Ok(None | Some([])) => continue,
+            Ok(Some(bytes)) => bytes,
             Err(error @ (LinkError::Stalled | LinkError::Overflow)) => {
                 stalls += 1;
-                let stalled = matches!(error, LinkError::Stalled);
                 let id = blocks.leader.take().map(|leader| leader.block_id);
                 spoil(shared, id, false);
-                let cleared = if stalled {
-                    link.clear_halt(reading.endpoint)
-                } else {
-                    Ok(())
-                };
-                match cleared {
-                    Ok(()) if stalls <= STALLS_MAX => continue,
-                    Ok(()) => return shared.end(Over::Link(Some(error))),
-                    Err(error) => return shared.end(Over::Link(Some(error))),
+                if matches!(error, LinkError::Stalled) {
+                    link.clear_halt(reading.endpoint).map_err(gone)?;
+                }
+                match stalls <= STALLS_MAX {
+                    true => continue,
+                    false => return Err(gone(error)),
                 }
             }
-            Err(error) => return shared.end(Over::Link(Some(error))),
+            Err(error) => return Err(gone(error)),
         };
         let now = Instant::now();
-        match blocks.take(&buffer[..n]) {
+        match blocks.take(bytes) {
             Step::Nothing => {}
             Step::Spoilt(id) => spoil(shared, id, false),
             Step::Block(leader, trailer) => {
                 stalls = 0;
-                if trailer.status != 0 {
-                    spoil(
-                        shared,
-                        Some(leader.block_id),
-                        DISCARDED.contains(&trailer.status),
-                    );
-                    continue;
-                }
-                match profiles(&leader, &trailer, &blocks.payload, reading, now) {
-                    Ok(profiles) => {
-                        let mut inbox = shared.lock();
-                        inbox.heard = now;
-                        inbox.accept(leader.block_id, profiles);
-                        drop(inbox);
-                        shared.arrived.notify_all();
-                    }
-                    Err(
-                        error @ DecodeError::Field {
-                            field: "pixel format",
-                            ..
-                        },
-                    ) => {
-                        return shared.end(Over::Decode(error));
-                    }
-                    Err(error) => {
-                        tracing::debug!(%error, "rejected a block");
-                        spoil(shared, Some(leader.block_id), false);
-                    }
-                }
+                let whole = (&leader, &trailer, &blocks.payload[..]);
+                block(shared, reading, whole, &mut wraps, now)?;
             }
         }
     }
+}
+
+/// Takes a block that came whole.
+fn block(
+    shared: &Shared,
+    reading: &Reading,
+    (leader, trailer, payload): (&Leader, &Trailer, &[u8]),
+    wraps: &mut Wraps,
+    now: Instant,
+) -> Result<(), Over> {
+    let id = leader.block_id;
+    if trailer.status != 0 {
+        spoil(shared, Some(id), DISCARDED.contains(&trailer.status));
+        return Ok(());
+    }
+    match profiles(leader, trailer, payload, reading, wraps, now) {
+        Ok(profiles) => {
+            let mut inbox = shared.lock();
+            inbox.heard = now;
+            inbox.accept(id, profiles);
+            drop(inbox);
+            shared.arrived.notify_all();
+        }
+        Err(
+            error @ DecodeError::Field {
+                field: "pixel format",
+                ..
+            },
+        ) => return Err(Over::Decode(error)),
+        Err(error) => {
+            tracing::debug!(%error, "rejected a block");
+            spoil(shared, Some(id), false);
+        }
+    }
+    Ok(())
 }
 
 fn spoil(shared: &Shared, id: Option<u64>, by_device: bool) {

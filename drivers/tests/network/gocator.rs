@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
 use acies_drivers::capture::Profile;
-use acies_drivers::device::{Instrument, Profiler};
+use acies_drivers::device::{Instrument, Presence, Profiler};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
@@ -338,6 +338,81 @@ fn the_laser_is_off_after_drop_and_for_a_host_that_died() {
     std::mem::forget(profiler);
     let again = open("gocator", &device.keys());
     assert!(again.is_ok() && !device.status().laser_on);
+}
+
+/// An encoder that trembles is delivered as it reads: what a reversal means is the assembly's to say (`acquire::assembler`).
+#[test]
+fn an_encoder_that_shakes_is_delivered_as_it_reads() {
+    let (_device, mut profiler) = start(Setup {
+        frames: 200,
+        ..wave(Misdeeds {
+            encoder_jitter: 15,
+            ..Misdeeds::default()
+        })
+    });
+    let profiles = scan(profiler.as_mut(), 200).expect("a scan");
+    let beside: Vec<i64> = (0..)
+        .zip(&profiles)
+        .map(|(index, profile)| profile.encoder.expect("an encoder") - 10 * index)
+        .collect();
+    assert!(beside.iter().all(|counts| counts.abs() <= 15));
+    let distinct: BTreeSet<&i64> = beside.iter().collect();
+    assert_eq!(distinct.len(), 31, "each number of the range is met");
+    let back = profiles
+        .windows(2)
+        .filter(|two| two[1].encoder < two[0].encoder);
+    assert!(back.count() > 20, "some of them against the motion");
+}
+
+#[test]
+fn replies_that_are_late_turned_or_unasked_are_told_apart() {
+    let late = |ms| Misdeeds {
+        late: Some(Duration::from_millis(ms)),
+        ..Misdeeds::default()
+    };
+    let stray = |stray_replies| Misdeeds {
+        stray_replies,
+        ..Misdeeds::default()
+    };
+    // What is not asked for is passed over, and a slow sensor waited for.
+    for misdeeds in [late(300), stray(5)] {
+        let (_device, mut profiler) = start(wave(misdeeds));
+        assert!(scan(profiler.as_mut(), 20).expect("a scan").len() >= 20);
+        assert_eq!(profiler.losses().lost_on_link, 0);
+    }
+    let told = |misdeeds| {
+        let device = SimulatedGocator::start(wave(misdeeds)).expect("a simulated sensor");
+        let text = refusal("gocator", &device.keys());
+        text.split_once(": ").expect("an address").1.to_owned()
+    };
+    let silent = "no answer within 3 s; check power and cable, then retry";
+    assert_eq!(told(late(3500)), silent);
+    assert_eq!(
+        told(stray(20)),
+        "bad data from the device: Get Protocol Version was answered by a message of another kind"
+    );
+    let turned = told(Misdeeds {
+        swap_bytes: true,
+        ..Misdeeds::default()
+    });
+    // 12 bytes, with the great end first.
+    assert_eq!(
+        turned,
+        "bad data from the device: frame says 201326592 bytes, at most 1048576 are allowed"
+    );
+}
+
+#[test]
+fn an_idle_sensor_is_asked_and_a_silent_one_told() {
+    let (device, mut profiler) = start(wave(Misdeeds {
+        silent_at: Some(50),
+        ..Misdeeds::default()
+    }));
+    assert_eq!(profiler.check().ok(), Some(Presence::Answered));
+    assert!(!device.status().laser_on);
+    scan(profiler.as_mut(), 10_000).expect_err("it falls silent");
+    let error = profiler.check().expect_err("a silent sensor");
+    assert!(error.may_pass(), "{}", text(&error));
 }
 
 #[test]

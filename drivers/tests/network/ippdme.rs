@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use acies_drivers::device::{Instrument, Probe};
+use acies_drivers::device::{Instrument, Presence, Probe};
 use acies_drivers::ippdme::Session;
 use acies_drivers::ippdme::line::{Kind, Tag, response};
 use acies_drivers::link::cable::Cable;
@@ -181,6 +181,26 @@ fn what_ends_a_touch_is_told() {
         commands.iter().any(|command| command == "AbortE()"),
         "{commands:?}"
     );
+}
+
+#[test]
+fn a_late_server_is_waited_for_and_an_idle_one_asked() {
+    let cell = DemoCell::new(3);
+    let device = cmm(&cell, |setup| setup.misdeeds.late_ms = Some(300));
+    let mut probe = probe(&device, "");
+    touch(probe.as_mut(), &cell, 0).expect("a touch");
+    let before = device.truth().touches_mm.len();
+    assert_eq!(probe.check().ok(), Some(Presence::Answered));
+    let truth = device.truth();
+    assert_eq!(
+        truth.commands.last().map(String::as_str),
+        Some("GetMachineClass()")
+    );
+    assert_eq!(truth.touches_mm.len(), before, "a check moves nothing");
+    drop(device);
+    let error = probe.check().expect_err("nobody there");
+    assert!(error.may_pass(), "{}", text(&error));
+    // One that takes longer than the 5 s of an acknowledgement is silent: `mute` below.
 }
 
 #[test]

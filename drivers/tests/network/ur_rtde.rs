@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use acies_drivers::capture::Pose;
-use acies_drivers::device::{Instrument, Robot};
+use acies_drivers::device::{Instrument, Presence, Robot};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::cable::Cable;
 use acies_drivers::link::recording::{Recorder, Recording};
@@ -104,6 +104,27 @@ fn skipped_damaged_and_doubled_packages_are_counted() {
         (poses.len() as u64, missing)
     );
     assert!(missing > 0 && losses.rejected > 0);
+}
+
+#[test]
+fn an_idle_robot_is_asked() {
+    let (device, mut robot) = start("");
+    assert_eq!(robot.check().ok(), Some(Presence::Answered));
+    assert!(!device.truth().running);
+    take(robot.as_mut(), 20).expect("20 poses");
+    assert_eq!(robot.check().ok(), Some(Presence::Answered));
+    robot.start().expect("a start");
+    assert!(
+        robot
+            .check()
+            .is_err_and(|error| error.to_string().contains("a device that streams"))
+    );
+    robot.stop().expect("a stop");
+    device.unplug();
+    let deadline = Instant::now() + SOON;
+    while robot.check().is_ok() {
+        assert!(Instant::now() < deadline, "nobody noticed");
+    }
 }
 
 /// What is told when these faults end a run.

@@ -11,7 +11,9 @@ use std::time::{Duration, Instant};
 
 use acies_drivers::error::LinkError;
 use acies_drivers::link::cable::Cable;
-use acies_drivers::link::usb::{Request, UsbInterface, UsbLink, UsbTarget, interfaces};
+use acies_drivers::link::usb::{
+    OneByOne, Request, UsbInterface, UsbLink, UsbStream, UsbTarget, interfaces,
+};
 use acies_drivers::link::{Link, Links, Target};
 use acies_simulators::u3v::{self, Profiler};
 use acies_simulators::usb::preload::Carrier;
@@ -54,13 +56,13 @@ pub trait Rig {
 
 /// A socket of either device.
 #[derive(Clone)]
-enum Plug {
+pub enum Plug {
     U3v(Socket<Profiler>),
     Itn(Socket<InputTool>),
 }
 
 impl Plug {
-    fn new(device: Device) -> Plug {
+    pub fn new(device: Device) -> Plug {
         match device {
             Device::U3v(setup) => Plug::U3v(Socket::new(Profiler::new(*setup))),
             Device::Itn(tool) => Plug::Itn(Socket::new(tool)),
@@ -86,6 +88,38 @@ impl Plug {
             Plug::Itn(socket) => {
                 socket.with(|tool| format!("raw={} asked={}", u8::from(tool.raw), tool.asked))
             }
+        }
+    }
+
+    pub fn unplug(&self) {
+        match self {
+            Plug::U3v(socket) => socket.unplug(),
+            Plug::Itn(socket) => socket.unplug(),
+        }
+    }
+
+    pub fn replug(&self) {
+        match self {
+            Plug::U3v(socket) => socket.replug(),
+            Plug::Itn(socket) => socket.replug(),
+        }
+    }
+
+    /// Does what needs no carrier.
+    pub fn carry_out(&self, order: &str) -> String {
+        match order {
+            "truth" => return self.truth(),
+            "press" => self.press(),
+            "another" => self.change(),
+            _ => panic!("no order {order}"),
+        }
+        String::new()
+    }
+
+    /// Makes a gauge another one of its kind.
+    fn change(&self) {
+        if let Plug::Itn(socket) = self {
+            socket.with(|tool| tool.serial = "ANOTHER".into());
         }
     }
 
@@ -118,14 +152,11 @@ impl Rig for InProcess {
 
     fn order(&self, order: &str) -> String {
         let plug = &self.links.0;
-        match (order, plug) {
-            ("truth", plug) => return plug.truth(),
-            ("press", plug) => plug.press(),
-            ("unplug", Plug::U3v(socket)) => socket.unplug(),
-            ("unplug", Plug::Itn(socket)) => socket.unplug(),
-            ("replug", Plug::U3v(socket)) => socket.replug(),
-            ("replug", Plug::Itn(socket)) => socket.replug(),
-            _ => panic!("no order {order}"),
+        match order {
+            "unplug" => plug.unplug(),
+            "replug" => plug.replug(),
+            order if order.starts_with("memory") => return "no system".into(),
+            order => return plug.carry_out(order),
         }
         String::new()
     }
@@ -245,6 +276,15 @@ impl<M: Model> UsbLink for Called<M> {
         answered(self.socket.output(endpoint, bytes), &mut [])
     }
 
+    fn stream(
+        &self,
+        endpoint: u8,
+        _: usize,
+        bytes: usize,
+    ) -> Result<Box<dyn UsbStream + '_>, LinkError> {
+        Ok(Box::new(OneByOne::new(self, endpoint, bytes)))
+    }
+
     fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError> {
         self.socket.clear_halt(endpoint);
         Ok(())
@@ -255,7 +295,7 @@ impl<M: Model> UsbLink for Called<M> {
 
 const CASE: &str = "ACIES_USB_CASE";
 /// Begins a line with which the child asks for something.
-const ORDER: &str = "ORDER ";
+pub const ORDER: &str = "ORDER ";
 
 /// The case and variant that this process is the child of.
 pub fn child_of_a_case() -> Option<(String, usize)> {
@@ -358,13 +398,15 @@ impl OverLibusb {
 
     fn carry_out(&self, order: &str) -> String {
         match (order, &self.carrier) {
-            ("truth", _) => return self.plug.truth(),
-            ("press", _) => self.plug.press(),
+            (order, AnyCarrier::U3v(carrier)) if order.starts_with("memory ") => {
+                let bytes = order["memory ".len()..].parse();
+                carrier.limit_memory(bytes.expect("a number"));
+            }
             ("unplug", AnyCarrier::U3v(carrier)) => carrier.unplug(),
             ("unplug", AnyCarrier::Itn(carrier)) => carrier.unplug(),
             ("replug", AnyCarrier::U3v(carrier)) => carrier.replug().expect("a tree"),
             ("replug", AnyCarrier::Itn(carrier)) => carrier.replug().expect("a tree"),
-            _ => panic!("no order {order}"),
+            (order, _) => return self.plug.carry_out(order),
         }
         String::new()
     }

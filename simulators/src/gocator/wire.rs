@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::{Form, Setup, Surface};
+use super::{Form, Misdeeds, Setup, Surface};
 use crate::sensor::Line;
 
 /// "Invalid range": 0x8000.
@@ -249,7 +249,7 @@ impl Camera {
         match &setup.surface {
             Surface::Wave(_) => {
                 let mut rows = self.waves[(index % WAVES) as usize].clone();
-                rows.encoder = 10 * index as i64;
+                rows.encoder = 10 * index as i64 + shake(setup.misdeeds.encoder_jitter, index);
                 rows
             }
             Surface::View(view) => rows_of(&view.line(index as u32), setup.form),
@@ -264,6 +264,28 @@ impl Camera {
             }
         }
     }
+}
+
+/// Counts beside the truth, as of a stage that trembles at an edge of the encoder: another number for each frame, the same every time.
+pub(crate) fn shake(most: u32, index: u64) -> i64 {
+    let most = i64::from(most);
+    // Steps of seven visit every number of a range that seven does not divide.
+    (7 * index as i64).rem_euclid(2 * most + 1) - most
+}
+
+/// A reply as it goes out where replies go wrong.
+pub fn spoilt(mut reply: Vec<u8>, misdeeds: &Misdeeds) -> Vec<u8> {
+    let mut stray = Vec::new();
+    for _ in 0..misdeeds.stray_replies {
+        // To "Get System Info" of an older version of the protocol, which nobody asked for.
+        stray.extend(self::reply(0x0002, 1, &[1, 2, 3]));
+    }
+    if misdeeds.swap_bytes && reply.len() >= 6 {
+        reply[..4].reverse();
+        reply[4..6].reverse();
+    }
+    stray.extend(reply);
+    stray
 }
 
 /// From frame to frame.

@@ -31,6 +31,7 @@ pub(super) struct Memory {
     features: Vec<u8>,
     columns: u32,
     lines: u32,
+    encoder_bytes: usize,
     middle_mm: f64,
 }
 
@@ -44,7 +45,7 @@ fn u32_at(bytes: &[u8], at: usize) -> u32 {
 
 impl Memory {
     pub fn new(setup: &Setup) -> Memory {
-        let xml = genicam();
+        let xml = genicam(setup.encoder_bytes);
         let file = match setup.zipped {
             true => zip(xml.as_bytes()),
             false => xml.into_bytes(),
@@ -93,6 +94,7 @@ impl Memory {
             features,
             columns: columns(setup),
             lines: setup.lines,
+            encoder_bytes: setup.encoder_bytes,
             middle_mm: middle_mm(setup),
         };
         memory.follow_format();
@@ -130,8 +132,9 @@ impl Memory {
         );
         let pixel = if counts { 2 } else { 12 };
         let image = u64::from(self.columns) * u64::from(self.lines) * pixel;
-        // Three chunks have a tail each, two of them eight bytes.
-        put(&mut self.sirm, 0x08, &(image + 3 * 8 + 2 * 8).to_le_bytes());
+        // Three chunks have a tail each, the time eight bytes, and the encoder its own.
+        let payload = image + 3 * 8 + 8 + self.encoder_bytes as u64;
+        put(&mut self.sirm, 0x08, &payload.to_le_bytes());
     }
 
     fn area(&mut self, address: u64) -> Option<(&mut Vec<u8>, usize, bool)> {
@@ -206,7 +209,7 @@ impl Memory {
 }
 
 /// The file: every feature with its register, and the ports of the chunks.
-fn genicam() -> String {
+fn genicam(encoder_bytes: usize) -> String {
     let mut nodes = String::new();
     let mut add = |text: String| nodes.push_str(&text);
     let address = |offset: usize| format!("0x{:X}", FEATURES + offset as u64);
@@ -277,14 +280,15 @@ fn genicam() -> String {
             address(offset)
         ));
     }
-    for (name, id) in [("ChunkEncoderValue", "E0"), ("ChunkTimestamp", "E1")] {
+    let encoder = ("ChunkEncoderValue", "E0", encoder_bytes as u32);
+    for (name, id, length) in [encoder, ("ChunkTimestamp", "E1", 8)] {
         add(format!(
             "<Integer Name=\"{name}\"><pValue>{name}Reg</pValue></Integer><Port Name=\"{name}Port\"><ChunkID>{id}</ChunkID></Port>"
         ));
         add(int_reg(
             &format!("{name}Reg"),
             "0x0",
-            8,
+            length,
             &format!("{name}Port"),
             true,
         ));

@@ -36,6 +36,7 @@ pub fn library() -> Option<PathBuf> {
 mod errno {
     pub const NOENT: i32 = 2;
     pub const AGAIN: i32 = 11;
+    pub const NOMEM: i32 = 12;
     pub const NODEV: i32 = 19;
     pub const INVAL: i32 = 22;
     pub const NOTTY: i32 = 25;
@@ -73,6 +74,8 @@ const ABILITIES: u32 = 0x1D;
 
 /// A transfer of the host that waits.
 struct Urb {
+    /// Whose it is: addresses are those of one handle.
+    client: u64,
     address: u64,
     endpoint: u8,
     control: bool,
@@ -90,6 +93,8 @@ struct Reaped {
 
 #[derive(Default)]
 struct Queue {
+    /// Most bytes of all transfers that wait, where the system has a limit.
+    memory: Option<usize>,
     waiting: VecDeque<Urb>,
     over: VecDeque<Reaped>,
     /// The node says that something is to be reaped.
@@ -162,15 +167,15 @@ impl<M: Model + 'static> Carrier<M> {
         };
         let shared = Arc::clone(&carrier.shared);
         carrier.spawn(move || {
-            for client in listener.incoming() {
+            for (id, client) in (0..).zip(listener.incoming()) {
                 if lock(&shared.queue).quit {
                     return;
                 }
                 let Ok(stream) = client else { continue };
                 let shared = Arc::clone(&shared);
                 std::thread::spawn(move || {
-                    let _ = Client { stream }.serve(&shared);
-                    shared.closed();
+                    let _ = Client { stream, id }.serve(&shared);
+                    shared.closed(id);
                 });
             }
         })?;
@@ -194,6 +199,11 @@ impl<M: Model + 'static> Carrier<M> {
             ("LD_PRELOAD", library.display().to_string()),
             ("UMOCKDEV_DIR", self.shared.folder.display().to_string()),
         ]
+    }
+
+    /// Lets transfers of at most so many bytes wait in all, as the kernel does (16 MiB where nobody has changed it).
+    pub fn limit_memory(&self, bytes: usize) {
+        lock(&self.shared.queue).memory = Some(bytes);
     }
 
     /// Pulls the device out: what waits ends, and the device leaves the tree.
@@ -350,10 +360,10 @@ impl<M: Model + 'static> Shared<M> {
     }
 
     /// The kernel ends the transfers of a handle that closes.
-    fn closed(&self) {
+    fn closed(&self, client: u64) {
         let mut queue = lock(&self.queue);
-        queue.waiting.clear();
-        queue.over.clear();
+        queue.waiting.retain(|urb| urb.client != client);
+        queue.over.retain(|reaped| reaped.urb.client != client);
         self.arm(&mut queue);
         drop(queue);
         self.socket.close();
@@ -392,6 +402,7 @@ fn finish(urb: Urb, outcome: Outcome) -> Reaped {
 /// One program that has the device open.
 struct Client {
     stream: UnixStream,
+    id: u64,
 }
 
 impl Client {
@@ -461,6 +472,7 @@ impl Client {
         let raw = self.read_memory(address, 56)?;
         let u32_at = |at: usize| raw[at..at + 4].try_into().map_or(0, u32::from_ne_bytes);
         let urb = Urb {
+            client: self.id,
             address,
             control: raw[0] == 2,
             endpoint: raw[1],
@@ -469,6 +481,12 @@ impl Client {
         };
         if !urb.control && urb.endpoint & 0x80 != 0 {
             let mut queue = shared.queue();
+            let held: usize = queue.waiting.iter().map(|urb| urb.length).sum();
+            let full = |most: usize| held + urb.length > most;
+            if queue.memory.is_some_and(full) {
+                drop(queue);
+                return self.done(-1, errno::NOMEM);
+            }
             queue.waiting.push_back(urb);
             shared.offer(&mut queue);
             drop(queue);
@@ -497,7 +515,8 @@ impl Client {
     fn reap<M: Model + 'static>(&mut self, shared: &Shared<M>, argument: u64) -> io::Result<()> {
         let reaped = {
             let mut queue = shared.queue();
-            let reaped = queue.over.pop_front();
+            let place = queue.over.iter().position(|r| r.urb.client == self.id);
+            let reaped = place.and_then(|place| queue.over.remove(place));
             shared.arm(&mut queue);
             reaped
         };
@@ -516,7 +535,10 @@ impl Client {
     fn discard<M: Model + 'static>(&mut self, shared: &Shared<M>, address: u64) -> io::Result<()> {
         let found = {
             let mut queue = shared.queue();
-            let place = queue.waiting.iter().position(|urb| urb.address == address);
+            let place = queue
+                .waiting
+                .iter()
+                .position(|urb| (urb.client, urb.address) == (self.id, address));
             let urb = place.and_then(|place| queue.waiting.remove(place));
             let found = urb.is_some();
             queue.over.extend(urb.map(|urb| Reaped {

@@ -13,9 +13,11 @@ fuzz_target!(|bytes: &[u8]| {
     let mut decoder = Decoder::default();
     decoder.expect(usize::from(*length));
     let mut run = Stream::new(50.0, length % 2 == 0, Duration::from_millis(5), Layout::SINGLE);
-    let now = Instant::now();
+    let mut at = Instant::now();
     for part in stream.chunks(5) {
-        decoder.take(part, |answer, skipped| run.take(&answer, skipped, now));
+        // Any pace: bytes that wait, and silence of a second.
+        at += Duration::from_millis(4 * u64::from(part[0]));
+        decoder.take(part, |answer, skipped| run.take(&answer, skipped, at));
         assert!(decoder.held_bytes() < ANSWER_MAX);
         while run.pop().is_some() {}
     }
