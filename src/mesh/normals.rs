@@ -18,7 +18,9 @@ pub enum Rings {
     One,
     /// And those at their corners.
     Two,
-    /// One or two, by the noise of the points.
+    /// The points of three rings, under noise that leaves triangles no direction.
+    Three,
+    /// One, two or three, by the noise of the points.
     Auto,
 }
 
@@ -36,6 +38,8 @@ pub struct Normals {
 /// Noise over spacing from which on two rings are taken: on a torus of ten thousand points one ring is better without noise, two from 0.03
 /// on.
 const TWO_RINGS_FROM: f64 = 0.02;
+/// The same for three.
+const THREE_RINGS_FROM: f64 = 0.05;
 /// Facets of the second ring that turn by more than this, rad (cosine), from the first lie beyond an edge.
 const BEYOND_EDGE: f64 = 0.82;
 /// Neighbours of the weighted plane (Ma 2011, §4.4.2).
@@ -46,18 +50,13 @@ const PLANE_NEIGHBOURS: usize = 40;
 /// We differ: the thesis takes the facets of an umbrella whether its neighbours have them or not, weighted by matching index times angle (Ma
 /// 2011, equation 4.6), and a plane where fewer than three match. Here every vertex has the closed ring of the mesh; facets that
 /// matching alone found weigh their index, the others one. Where the surface turns smoothly and points are clean, that
-/// normal is corrected by a cubic through two rings. The plane remains for points without triangles. Orientation needs no
-/// propagation: the body has an outside. Whether one ring or two follows from the noise of the points, not from the user.
+/// normal is corrected by a cubic through two rings; under strong noise it is that of a quadric through three. The plane remains for points without triangles. Orientation needs no
+/// propagation: the body has an outside. How many rings follows from the noise of the points, not from the user.
 pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Rings) -> Normals {
     let rings = match rings {
         Rings::Auto => {
             let spacing = spacing(cloud, neighbors);
-            let noise = noise_mm(cloud, neighbors, &spacing);
-            if noise > TWO_RINGS_FROM * spacing.mean_mm {
-                Rings::Two
-            } else {
-                Rings::One
-            }
+            by_noise(noise_mm(cloud, neighbors, &spacing) / spacing.mean_mm)
         }
         chosen => chosen,
     };
@@ -71,6 +70,16 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
             .into_par_iter()
             .map(|v| two_rings(body, v, &one).as_vec3())
             .collect(),
+        Rings::Three => {
+            let two: Vec<DVec3> = (0..count)
+                .into_par_iter()
+                .map(|v| two_rings(body, v, &one))
+                .collect();
+            (0..count)
+                .into_par_iter()
+                .map(|v| quadric(body, v, &two).unwrap_or(two[v as usize]).as_vec3())
+                .collect()
+        }
         _ => (0..count)
             .into_par_iter()
             .map(|v| cubic(body, v, &one).unwrap_or(one[v as usize]).as_vec3())
@@ -94,6 +103,16 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
         normals,
         rings,
         by_plane,
+    }
+}
+
+fn by_noise(noise_over_spacing: f64) -> Rings {
+    if noise_over_spacing > THREE_RINGS_FROM {
+        Rings::Three
+    } else if noise_over_spacing > TWO_RINGS_FROM {
+        Rings::Two
+    } else {
+        Rings::One
     }
 }
 
@@ -205,6 +224,48 @@ fn two_rings(body: &Body, v: u32, one: &[DVec3]) -> DVec3 {
         });
     }
     sum.try_normalize().unwrap_or(own)
+}
+
+/// The normal of the quadric height function over the points of three rings around `v`, those beyond an edge left out, or none where there are too
+/// few.
+///
+/// We differ: the thesis takes triangles of two rings under noise and still falls behind planes through neighbours where it is strong (Ma 2011,
+/// figures 4.11 and 4.12); the rings of the mesh keep apart what lies on two sides of a wall or an edge, and the fit averages as
+/// many points as planes do.
+fn quadric(body: &Body, v: u32, two: &[DVec3]) -> Option<DVec3> {
+    const LEAST_POINTS: usize = 12;
+    const RINGS: usize = 3;
+    let own = two[v as usize];
+    let mut around = vec![v];
+    let mut done = 0;
+    for _ in 0..RINGS {
+        let reached = around.len();
+        for i in done..reached {
+            triangles_at(body, around[i], |_, _, others, _| {
+                for u in others {
+                    if two[u as usize].dot(own) > BEYOND_EDGE && !around.contains(&u) {
+                        around.push(u);
+                    }
+                }
+            });
+        }
+        done = reached;
+    }
+    if around.len() < LEAST_POINTS {
+        return None;
+    }
+    let p = body.delaunay.points[v as usize];
+    let x = own.any_orthonormal_vector();
+    let y = own.cross(x);
+    let ways = around.iter().map(|u| body.delaunay.points[*u as usize] - p);
+    let reach = ways.clone().map(|d| d.length()).fold(0.0, f64::max);
+    let mut sums = NormalSums::<6>::default();
+    for d in ways {
+        let (a, b) = (d.dot(x) / reach, d.dot(y) / reach);
+        sums.add(&[a, b, 1.0, a * a, a * b, b * b], d.dot(own) / reach, 1.0);
+    }
+    let ([a, b, ..], _) = sums.solve()?;
+    Some((own - x * a - y * b).normalize())
 }
 
 /// Turns `normals` to one sense: along the edges of the graph of nearest neighbours, the most parallel first (Hoppe et al. 1992; Ma 2011,

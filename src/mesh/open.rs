@@ -1,12 +1,13 @@
 //! Surfaces with borders: the part of a closed surface that was seen.
 //!
 //! A scan is open nearly always. Closed, its mesh bridges what was never seen by triangles far larger than the spacing around; these are
-//! left out. Of a sheet, which bounds no body, the matched facets are taken, as the thesis leaves them (Ma 2011, §3.4).
+//! left out. A sheet, which bounds no body, is grown from the umbrellas ([`super::sheet`]).
 
 use std::collections::HashMap;
 
 use super::Body;
 use super::delaunay::{Delaunay, GHOST};
+use super::sheet::sheet;
 use super::solid::surface;
 use super::star::vertices;
 
@@ -20,77 +21,37 @@ const SHEET: f64 = 0.05;
 pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
     let is_sheet = body.mending.before as f64 > SHEET * delaunay.points.len() as f64;
-    let mut triangles = if is_sheet {
-        oriented(matched(body))
+    let closed = if is_sheet {
+        matched(body)
     } else {
         surface(delaunay, &body.solid.inside)
     };
-    let typical = typical_edges(delaunay, &triangles);
+    let typical = typical_edges(delaunay, &closed);
     let most = longest_seen(&typical);
-    triangles.retain(|t| {
+    let is_seen = |t: [u32; 3]| {
         (0..3).all(|k| {
             let (a, b) = (t[k], t[(k + 1) % 3]);
             let length = delaunay.points[a as usize].distance(delaunay.points[b as usize]);
             length <= (BRIDGE * typical[a as usize].min(typical[b as usize])).min(most)
         })
-    });
+    };
+    let triangles = if is_sheet {
+        sheet(body, is_seen)
+    } else {
+        closed.into_iter().filter(|t| is_seen(*t)).collect()
+    };
     one_fan_each(delaunay.points.len(), triangles)
 }
 
+/// Facets that at least two of their three corners have in their umbrellas.
 fn matched(body: &Body) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
     (0..4 * delaunay.cells.len() as u32)
         .filter(|f| delaunay.neighbors[(f >> 2) as usize][(f & 3) as usize] > f >> 2)
-        .filter(|f| body.facets.matches(*f) == 3)
+        .filter(|f| body.facets.matches(*f) >= 2)
         .map(|f| vertices(delaunay, f))
         .filter(|t| !t.contains(&GHOST))
         .collect()
-}
-
-/// The triangles with neighbours turned alike, from the first of every piece on.
-fn oriented(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
-    let mut at: HashMap<(u32, u32), Vec<u32>> = HashMap::with_capacity(2 * triangles.len());
-    for (i, t) in triangles.iter().enumerate() {
-        for k in 0..3 {
-            let (a, b) = (t[k], t[(k + 1) % 3]);
-            at.entry((a.min(b), a.max(b))).or_default().push(i as u32);
-        }
-    }
-    let mut is_done = vec![false; triangles.len()];
-    let mut stack = Vec::new();
-    for start in 0..triangles.len() {
-        if std::mem::replace(&mut is_done[start], true) {
-            continue;
-        }
-        stack.push(start);
-        while let Some(i) = stack.pop() {
-            let t = triangles[i];
-            for k in 0..3 {
-                let (a, b) = (t[k], t[(k + 1) % 3]);
-                for &j in &at[&(a.min(b), a.max(b))] {
-                    let j = j as usize;
-                    if !std::mem::replace(&mut is_done[j], true) {
-                        let other = &mut triangles[j];
-                        if (0..3).any(|k| other[k] == a && other[(k + 1) % 3] == b) {
-                            other.swap(0, 1);
-                        }
-                        stack.push(j);
-                    }
-                }
-            }
-        }
-    }
-    // What could not be turned alike parts at its edges.
-    let mut seen: HashMap<(u32, u32), ()> = HashMap::new();
-    triangles.retain(|t| {
-        let sides = [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])];
-        let is_new = sides.iter().all(|s| !seen.contains_key(s));
-        if is_new {
-            seen.extend(sides.map(|s| (s, ())));
-        }
-        is_new
-    });
-    triangles
 }
 
 /// For every vertex the median of the lengths of its triangles' edges.
