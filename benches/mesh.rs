@@ -227,6 +227,25 @@ fn table52() {
     );
 }
 
+/// The edges of the triangulation: no mesh made of it has others.
+fn possible(points: &[DVec3]) -> HashSet<(u32, u32)> {
+    let delaunay = Delaunay::new(points).expect("a body");
+    let source = |v: u32| {
+        delaunay
+            .sources
+            .get(v as usize)
+            .copied()
+            .unwrap_or(u32::MAX)
+    };
+    let ordered = |a: u32, b: u32| (a.min(b), a.max(b));
+    (delaunay.cells.iter())
+        .map(|c| c.map(source))
+        .flat_map(|c| {
+            [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].map(|(i, j)| ordered(c[i], c[j]))
+        })
+        .collect()
+}
+
 /// Links along true edges, for clouds whose points on edges come first and in order.
 ///
 /// Where a point of a face lies too near an edge the link there is no edge of the Delaunay triangulation, and no mesh made of it can have it.
@@ -241,20 +260,7 @@ fn links(made: &Mesh, sampled: &clouds::Sampled) {
             ]
         })
         .collect();
-    let delaunay = Delaunay::new(&sampled.points).expect("a body");
-    let source = |v: u32| {
-        delaunay
-            .sources
-            .get(v as usize)
-            .copied()
-            .unwrap_or(u32::MAX)
-    };
-    let possible: HashSet<(u32, u32)> = (delaunay.cells.iter())
-        .map(|c| c.map(source))
-        .flat_map(|c| {
-            [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].map(|(i, j)| ordered(c[i], c[j]))
-        })
-        .collect();
+    let possible = possible(&sampled.points);
     let on_edge = sampled.on_edge.iter().filter(|o| **o).count() as u32;
     let along = |i: &u32| {
         let [a, b] = [*i - 1, *i].map(|i| sampled.points[i as usize]);
@@ -452,6 +458,8 @@ fn sharp() {
         rows.extend(labelled(name).map(|found| (name, found)));
     }
     for (name, (points, edges)) in rows {
+        let possible = possible(&points);
+        let most = edges.iter().filter(|e| possible.contains(e)).count();
         for cone in [false, true] {
             let made = mesh(&points, Settings { cone, open: false }).expect("a body");
             let has: HashSet<(u32, u32)> = (made.triangles.iter())
@@ -461,7 +469,7 @@ fn sharp() {
                 .collect();
             let found = edges.iter().filter(|e| has.contains(e)).count();
             println!(
-                "{name:22} cone {cone:5} {found:5} of {:5} {:6.2} %  matched {:.2} %, genus {:?}, {:?}",
+                "{name:22} cone {cone:5} {found:5} of {:5} {:6.2} % ({most} in the triangulation)  matched {:.2} %, genus {:?}, {:?}",
                 edges.len(),
                 100.0 * found as f64 / edges.len() as f64,
                 made.matched_percent(),
@@ -515,7 +523,13 @@ fn open_scans() {
             let along = across / ratio;
             let solid = solids::block();
             let sampled = solid.scan(used, (along, across), 0.1 * along, 3);
-            open_row(&format!("1:{ratio} {} views", used.len()), &solid, &sampled, used, (along, across));
+            open_row(
+                &format!("1:{ratio} {} views", used.len()),
+                &solid,
+                &sampled,
+                used,
+                (along, across),
+            );
         }
     }
 }
@@ -561,7 +575,12 @@ fn open_row(
         let is_near = |way: DVec3| {
             let hit = |f: &clouds::Face| f.hit(centre + way * 100.0, -way);
             let off = |(t, _): (f64, DVec3)| (t - 100.0).abs();
-            solid.faces.iter().filter_map(hit).map(off).any(|d| d < 0.5 * across)
+            solid
+                .faces
+                .iter()
+                .filter_map(hit)
+                .map(off)
+                .any(|d| d < 0.5 * across)
         };
         off += usize::from(!is_near(n) && !is_near(views[0]));
         for v in &triangle[1..] {
@@ -571,18 +590,28 @@ fn open_row(
     }
     let mut sizes = std::collections::HashMap::new();
     for triangle in &made.triangles {
-        *sizes.entry(root(&mut parent, triangle[0])).or_insert(0usize) += 1;
+        *sizes
+            .entry(root(&mut parent, triangle[0]))
+            .or_insert(0usize) += 1;
     }
     let largest = sizes.values().max().copied().unwrap_or(0);
     println!(
         "{name:22} {:8} {:9.2} {:8.3} {:6} {:9.2} {:10} {off:8} {seconds:8.2} {}",
         made.positions.len(),
         100.0 * t.vertices as f64 / made.positions.len() as f64,
-        if views.len() == 1 { total / seen } else { f64::NAN },
+        if views.len() == 1 {
+            total / seen
+        } else {
+            f64::NAN
+        },
         t.pieces,
         100.0 * largest as f64 / made.triangles.len().max(1) as f64,
         t.open_edges,
-        if t.is_manifold() { "manifold" } else { "NOT manifold" },
+        if t.is_manifold() {
+            "manifold"
+        } else {
+            "NOT manifold"
+        },
     );
     picture_of(name, &made);
 }

@@ -146,9 +146,10 @@ impl Body {
         let mut solid = vote(&delaunay, &stars, &facets);
         settle(&delaunay, &facets, &mut solid);
         lap("inside");
-        let mending = mend(&delaunay, &stars, &facets, &mut solid);
+        // What closes an open scan is thrown away again: cells as large as the part, at vertices of thousands.
+        let mending = mend(&delaunay, &stars, &facets, &mut solid, !settings.open);
         lap("mend");
-        if settings.cone {
+        if settings.cone && !settings.open {
             sharpen::sharpen(&delaunay, &stars, &mut solid.inside);
         }
         lap("sharpen");

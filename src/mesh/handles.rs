@@ -53,11 +53,7 @@ impl Net {
 /// The edges that neither a tree of the vertices nor one of the triangles across the others has lie on the handles, two for each (Eppstein,
 /// *Dynamic generators of topologically embedded graphs*, 2003); from their ends the shortest loops are found the same way (Erickson and
 /// Whittlesey, *Greedy optimal homotopy and homology generators*, 2005).
-pub(super) fn short_loops(
-    vertices: usize,
-    triangles: &[[u32; 3]],
-    most: usize,
-) -> Vec<Vec<u32>> {
+pub(super) fn short_loops(vertices: usize, triangles: &[[u32; 3]], most: usize) -> Vec<Vec<u32>> {
     let net = Net::new(vertices, triangles);
     let mut found: Vec<Vec<u32>> = ends_on_handles(&net, vertices, triangles.len())
         .into_iter()

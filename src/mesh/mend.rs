@@ -83,8 +83,15 @@ pub(super) fn defect(
 ///
 /// A search around one wrong vertex at a time: of all cells at the wrong vertices the one is turned that leaves the fewest wrong, among equals
 /// the one that votes and sizes speak for. A turned cell rests a while, so that the search leaves blind alleys; what did not lead to fewer
-/// wrong vertices is taken back. One thread; the order is that of the vertices.
-pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Solid) -> Mending {
+/// wrong vertices is taken back. One thread; the order is that of the vertices. Only counted where it is not
+/// wanted.
+pub fn mend(
+    delaunay: &Delaunay,
+    stars: &Stars,
+    facets: &Facets,
+    solid: &mut Solid,
+    is_wanted: bool,
+) -> Mending {
     let count = delaunay.points.len() as u32;
     let inside = &solid.inside;
     let defects: Vec<u8> = (0..count)
@@ -95,6 +102,13 @@ pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Sol
         .collect();
     let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
     let before = wrong.len();
+    if !is_wanted {
+        return Mending {
+            before,
+            after: before,
+            turns: 0,
+        };
+    }
     let mut search = Search {
         delaunay,
         stars,
@@ -124,8 +138,10 @@ pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Sol
         }
     }
     turns += search.close_handles();
-    turns += search.close_short_handles();
-    turns += search.join_islands();
+    if wrong.is_empty() {
+        turns += search.close_short_handles();
+        turns += search.join_islands();
+    }
     Mending {
         before,
         after: wrong.len(),
@@ -236,8 +252,10 @@ impl Search<'_> {
     ///
     /// We differ: the thesis only counts handles (Ma 2011, equation 3.2).
     fn close_short_handles(&mut self) -> usize {
-        const STEPS: usize = 80;
-        let mut turns = 0;
+        const STEPS: usize = 40;
+        /// Cells that are tried in all: a surface with more short handles is no surface of a part.
+        const MOST: usize = 2_000;
+        let (mut turns, mut tries) = (0, 0);
         for _ in 0..8 {
             let triangles = super::solid::surface(self.delaunay, &self.solid.inside);
             let loops = short_loops(self.delaunay.points.len(), &triangles, LONGEST_LOOP);
@@ -245,6 +263,10 @@ impl Search<'_> {
             for ring in loops {
                 let mut best: Option<(f32, Vec<u32>)> = None;
                 for cell in self.cells_along(&ring) {
+                    tries += 1;
+                    if tries > MOST {
+                        break;
+                    }
                     let (triangles, growth) = self.follow(cell, STEPS);
                     let is_better = best.as_ref().is_none_or(|(least, _)| growth < *least);
                     let is_less = triangles.is_some_and(|t| t < 0);
@@ -325,8 +347,10 @@ impl Search<'_> {
         let own = piece[v as usize];
         let goes = |c: u32| self.solid.inside[c as usize] == inside && !self.delaunay.is_ghost(c);
         let start = self.stars.of(v).iter().map(|code| code >> 2);
-        let mut found: Vec<(u32, usize)> =
-            start.filter(|c| goes(*c)).map(|c| (c, usize::MAX)).collect();
+        let mut found: Vec<(u32, usize)> = start
+            .filter(|c| goes(*c))
+            .map(|c| (c, usize::MAX))
+            .collect();
         let mut seen: HashSet<u32> = found.iter().map(|f| f.0).collect();
         let mut at = 0;
         while at < found.len().min(MOST) {

@@ -20,7 +20,7 @@ pub enum Rings {
     Two,
     /// The points of three rings, under noise that leaves triangles no direction.
     Three,
-    /// One, two or three, by the noise of the points.
+    /// One or three, by the noise of the points.
     Auto,
 }
 
@@ -35,11 +35,9 @@ pub struct Normals {
     pub by_plane: usize,
 }
 
-/// Noise over spacing from which on two rings are taken: on a torus of ten thousand points one ring is better without noise, two from 0.03
-/// on.
-const TWO_RINGS_FROM: f64 = 0.02;
-/// The same for three.
-const THREE_RINGS_FROM: f64 = 0.05;
+/// Noise over spacing from which on three rings are taken: on a torus of ten thousand points one ring is best without noise, three from 0.015 on.
+/// Two are best between, but so little noise cannot be told from the bend of a surface.
+const THREE_RINGS_FROM: f64 = 0.02;
 /// Facets of the second ring that turn by more than this, rad (cosine), from the first lie beyond an edge.
 const BEYOND_EDGE: f64 = 0.82;
 /// Neighbours of the weighted plane (Ma 2011, §4.4.2).
@@ -56,7 +54,11 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
     let rings = match rings {
         Rings::Auto => {
             let spacing = spacing(cloud, neighbors);
-            by_noise(noise_mm(cloud, neighbors, &spacing) / spacing.mean_mm)
+            if noise_mm(cloud, neighbors, &spacing) > THREE_RINGS_FROM * spacing.mean_mm {
+                Rings::Three
+            } else {
+                Rings::One
+            }
         }
         chosen => chosen,
     };
@@ -106,19 +108,8 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
     }
 }
 
-fn by_noise(noise_over_spacing: f64) -> Rings {
-    if noise_over_spacing > THREE_RINGS_FROM {
-        Rings::Three
-    } else if noise_over_spacing > TWO_RINGS_FROM {
-        Rings::Two
-    } else {
-        Rings::One
-    }
-}
-
-/// Calls `with` for every triangle of the surface at `v`: its outward normal (twice the area long), its angle at `v`, rad, other
-/// corners, and facet.
-fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, f64, [u32; 2], u32)) {
+/// Calls `with` for every triangle of the surface at `v`: its outward normal (twice the area long), other corners, and facet.
+fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, [u32; 2], u32)) {
     let delaunay = &body.delaunay;
     for code in body.stars.of(v) {
         let (cell, own) = corner(*code);
@@ -135,23 +126,18 @@ fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, f64, [u32; 2], 
             let normal = (b - a).cross(c - a);
             let at_v = corners.iter().position(|u| *u == v).unwrap_or(0);
             let others = [corners[(at_v + 1) % 3], corners[(at_v + 2) % 3]];
-            let p = delaunay.points[v as usize];
-            let [u, w] = others.map(|u| delaunay.points[u as usize] - p);
-            let angle = u.cross(w).length().atan2(u.dot(w));
-            with(normal, angle, others, facet(delaunay, cell, at));
+            with(normal, others, facet(delaunay, cell, at));
         }
     }
 }
 
-/// Outward normals of the triangles at `v`, weighted by matching index times angle (Ma 2011, equation 4.6).
+/// Outward normals of the triangles at `v`, weighted by matching index times area.
+///
+/// We differ: the thesis weighs by angle (Ma 2011, equation 4.6); on a torus, where normals are known, areas leave half of its error.
 fn ring_sum(body: &Body, v: u32) -> DVec3 {
     let mut sum = DVec3::ZERO;
-    triangles_at(body, v, |normal, angle, _, facet| {
-        let matches = f64::from(body.facets.matches(facet).max(1));
-        let term = normal.normalize_or_zero() * (matches * angle);
-        if term.is_finite() {
-            sum += term;
-        }
+    triangles_at(body, v, |normal, _, facet| {
+        sum += normal * f64::from(body.facets.matches(facet).max(1));
     });
     sum
 }
@@ -164,9 +150,9 @@ fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
     const STEEPEST: f64 = 0.3;
     let own = one[v as usize];
     let mut around = Vec::new();
-    triangles_at(body, v, |_, _, others, _| around.extend(others));
+    triangles_at(body, v, |_, others, _| around.extend(others));
     for i in 0..around.len() {
-        triangles_at(body, around[i], |_, _, others, _| around.extend(others));
+        triangles_at(body, around[i], |_, others, _| around.extend(others));
     }
     around.sort_unstable();
     around.dedup();
@@ -212,12 +198,12 @@ fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
 fn two_rings(body: &Body, v: u32, one: &[DVec3]) -> DVec3 {
     let own = one[v as usize];
     let mut around = vec![v];
-    triangles_at(body, v, |_, _, others, _| around.extend(others));
+    triangles_at(body, v, |_, others, _| around.extend(others));
     around.sort_unstable();
     around.dedup();
     let mut sum = DVec3::ZERO;
     for u in around {
-        triangles_at(body, u, |normal, _, _, _| {
+        triangles_at(body, u, |normal, _, _| {
             if normal.normalize_or_zero().dot(own) > BEYOND_EDGE {
                 sum += normal;
             }
@@ -241,7 +227,7 @@ fn quadric(body: &Body, v: u32, two: &[DVec3]) -> Option<DVec3> {
     for _ in 0..RINGS {
         let reached = around.len();
         for i in done..reached {
-            triangles_at(body, around[i], |_, _, others, _| {
+            triangles_at(body, around[i], |_, others, _| {
                 for u in others {
                     if two[u as usize].dot(own) > BEYOND_EDGE && !around.contains(&u) {
                         around.push(u);

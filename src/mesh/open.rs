@@ -1,4 +1,4 @@
-//! Surfaces with borders: the part of a closed surface that was seen.
+//! Surfaces with borders: what of a part was seen.
 //!
 //! A scan is open nearly always. Closed, its mesh bridges what was never seen by triangles far larger than the spacing around; these are
 //! left out. A sheet, which bounds no body, is grown from the umbrellas ([`super::sheet`]).
@@ -7,26 +7,17 @@ use std::collections::HashMap;
 
 use super::Body;
 use super::delaunay::{Delaunay, GHOST};
-use super::sheet::sheet;
-use super::solid::surface;
+use super::sheet::{is_needle, sheet};
 use super::star::vertices;
 
 /// A triangle bridges where an edge of it is longer than so many times the typical edges at its ends: a scan line is up to twenty
 /// times denser along than across, and there typical is the longer.
 const BRIDGE: f64 = 4.0;
-/// Share of wrong vertices after the vote from which on the points are no body.
-const SHEET: f64 = 0.05;
 
-/// The triangles of the body's surface that bridge nothing, as a manifold with borders.
+/// The triangles of the points' surface that bridge nothing, as a manifold with borders.
 pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
-    let is_sheet = body.mending.before as f64 > SHEET * delaunay.points.len() as f64;
-    let closed = if is_sheet {
-        matched(body)
-    } else {
-        surface(delaunay, &body.solid.inside)
-    };
-    let typical = typical_edges(delaunay, &closed);
+    let typical = typical_edges(delaunay, &sure(body));
     let most = longest_seen(&typical);
     let is_seen = |t: [u32; 3]| {
         (0..3).all(|k| {
@@ -35,22 +26,16 @@ pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
             length <= (BRIDGE * typical[a as usize].min(typical[b as usize])).min(most)
         })
     };
-    let triangles = if is_sheet {
-        sheet(body, is_seen)
-    } else {
-        closed.into_iter().filter(|t| is_seen(*t)).collect()
-    };
-    one_fan_each(delaunay.points.len(), triangles)
+    one_fan_each(delaunay.points.len(), sheet(body, is_seen))
 }
 
-/// Facets that at least two of their three corners have in their umbrellas.
-fn matched(body: &Body) -> Vec<[u32; 3]> {
+/// The facets whose smallest sphere is empty, needles left out: nearly all are on the surface.
+fn sure(body: &Body) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
     (0..4 * delaunay.cells.len() as u32)
-        .filter(|f| delaunay.neighbors[(f >> 2) as usize][(f & 3) as usize] > f >> 2)
-        .filter(|f| body.facets.matches(*f) >= 2)
+        .filter(|f| body.facets.is_gabriel(*f))
         .map(|f| vertices(delaunay, f))
-        .filter(|t| !t.contains(&GHOST))
+        .filter(|t| !t.contains(&GHOST) && !is_needle(delaunay, *t))
         .collect()
 }
 

@@ -2,7 +2,8 @@
 //!
 //! We differ: where umbrellas do not match, the thesis leaves holes (Ma 2011, §3.4), and a scan from one side falls into pieces. Here facets are
 //! taken one by one, those of all three umbrellas first, then the others by size, as long as the whole stays a manifold of two sides
-//! without folds.
+//! without folds. Needles come last, and facets come in that no umbrella has but whose smallest sphere is empty: on scan lines an umbrella
+//! of the smallest facets is one of points of its own line.
 
 use glam::DVec3;
 use rayon::prelude::*;
@@ -14,6 +15,9 @@ use super::star::vertices;
 
 /// Two triangles that meet at an edge at a lesser angle than this, rad (cosine), are a fold and no surface: 25 degrees.
 const FOLD: f64 = 0.906;
+
+/// A triangle with an angle above this, rad (cosine), is a needle: 145 degrees.
+const NEEDLE: f64 = -0.82;
 
 /// The triangles at a vertex: their other two corners, and their place in the list of all.
 type Link = Vec<([u32; 2], u32)>;
@@ -34,12 +38,18 @@ pub(super) fn sheet(body: &Body, fits: impl Fn([u32; 3]) -> bool + Sync) -> Vec<
         .filter_map(|f| {
             let matches = body.facets.matches(f);
             let corners = vertices(delaunay, f);
-            if matches == 0 || corners.contains(&GHOST) || !fits(corners) {
+            let is_known = matches > 0 || body.facets.is_gabriel(f);
+            if !is_known || corners.contains(&GHOST) || !fits(corners) {
                 return None;
             }
+            let level = match matches {
+                _ if is_needle(delaunay, corners) => 2,
+                3 => 0,
+                _ => 1,
+            };
             let radius = body.facets.radius(f >> 2, (f & 3) as usize);
             // The bits of a positive number sort as the number does.
-            Some((3 - matches, radius.to_bits(), f))
+            Some((level, radius.to_bits(), f))
         })
         .collect();
     wanted.par_sort_unstable();
@@ -63,6 +73,17 @@ pub(super) fn sheet(body: &Body, fits: impl Fn([u32; 3]) -> bool + Sync) -> Vec<
         }
     }
     triangles
+}
+
+/// Whether the three corners are nearly on a line: of points of one scan line, whose triangles are smaller than those between lines, and no surface.
+pub(super) fn is_needle(delaunay: &Delaunay, t: [u32; 3]) -> bool {
+    let [a, b, c] = t.map(|v| delaunay.points[v as usize]);
+    let cosine = |at: DVec3, p: DVec3, q: DVec3| {
+        (p - at)
+            .normalize_or_zero()
+            .dot((q - at).normalize_or_zero())
+    };
+    cosine(a, b, c).min(cosine(b, c, a)).min(cosine(c, a, b)) < NEEDLE
 }
 
 impl Sheet<'_> {
