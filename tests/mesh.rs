@@ -341,6 +341,23 @@ fn the_mesh_depends_neither_on_threads_nor_on_the_order_of_points() {
     assert_eq!(one, back);
 }
 
+#[test]
+fn the_triangulation_has_the_same_bits_on_any_number_of_threads() {
+    // Long cells through the middle that all threads want, and nothing but cospherical points.
+    for points in [
+        bodies::ellipsoid(30_000, DVec3::new(1.0, 1.0, 1.0)).points,
+        grid(28),
+    ] {
+        let with = |threads: usize| rayon_pool(threads).install(|| triangulated(&points));
+        let one = with(1);
+        for threads in [2, 5] {
+            let other = with(threads);
+            assert_eq!(one.cells, other.cells);
+            assert_eq!(one.neighbors, other.neighbors);
+        }
+    }
+}
+
 fn rayon_pool(threads: usize) -> rayon::ThreadPool {
     rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
@@ -369,6 +386,35 @@ fn open_scans_keep_their_borders() {
         .map(|(a, b)| made.positions[a as usize].distance(made.positions[b as usize]))
         .fold(0.0, f64::max);
     assert!(longest < 8.0 * sampled.spacing, "{longest} bridges");
+}
+
+#[test]
+fn a_scan_by_lines_from_one_side_is_a_sheet() {
+    // Lines ten times sparser than the points along them.
+    let (along, across) = (0.2, 2.0);
+    let view = DVec3::new(0.1, 0.05, 1.0).normalize();
+    let block = solids::block();
+    let sampled = block.scan(&[view], (along, across), 0.1 * along, 3);
+    let settings = Settings {
+        open: true,
+        ..Settings::default()
+    };
+    let made = mesh(&sampled.points, settings).expect("a body");
+    let t = made.topology;
+    assert!(t.is_manifold(), "{t:?}");
+    // Points that noise puts across their neighbours on the line are passed by, and slits stay where they were.
+    let used = t.vertices as f64 / made.positions.len() as f64;
+    assert!(used > 0.95, "{used} of the points, {t:?}");
+    let seen: f64 = (sampled.points.iter().zip(&sampled.faces))
+        .filter_map(|(p, f)| block.faces[usize::from(*f)].hit(*p + view * 100.0, -view))
+        .map(|(_, n)| along * across / n.dot(view).abs())
+        .sum();
+    let share = area(&made) / seen;
+    // A line more or less at the borders: one of forty each.
+    assert!(
+        (0.9..1.05).contains(&share),
+        "{share} of the area seen, {t:?}"
+    );
 }
 
 #[test]

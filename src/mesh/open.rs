@@ -10,20 +10,19 @@ use super::delaunay::{Delaunay, GHOST};
 use super::sheet::{is_needle, sheet};
 use super::star::vertices;
 
-/// A triangle bridges where an edge of it is longer than so many times the typical edges at its ends: a scan line is up to twenty
-/// times denser along than across, and there typical is the longer.
-const BRIDGE: f64 = 4.0;
+/// An edge longer than so many times the typical ones of nine in ten vertices bridges whatever its surroundings.
+const LONGEST: f64 = 4.0;
 
 /// The triangles of the points' surface that bridge nothing, as a manifold with borders.
 pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
     let typical = typical_edges(delaunay, &sure(body));
     let most = longest_seen(&typical);
-    let is_seen = |t: [u32; 3]| {
+    let is_seen = |t: [u32; 3], times: f64| {
         (0..3).all(|k| {
             let (a, b) = (t[k], t[(k + 1) % 3]);
             let length = delaunay.points[a as usize].distance(delaunay.points[b as usize]);
-            length <= (BRIDGE * typical[a as usize].min(typical[b as usize])).min(most)
+            length <= (times * typical[a as usize].min(typical[b as usize])).min(most)
         })
     };
     one_fan_each(delaunay.points.len(), sheet(body, is_seen))
@@ -67,7 +66,7 @@ fn longest_seen(typical: &[f64]) -> f64 {
         return f64::INFINITY;
     }
     let at = (all.len() - 1) * 9 / 10;
-    BRIDGE * *all.select_nth_unstable_by(at, f64::total_cmp).1
+    LONGEST * *all.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
 /// Leaves every vertex one fan or ring of triangles, the largest.

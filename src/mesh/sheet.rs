@@ -2,7 +2,7 @@
 //!
 //! We differ: where umbrellas do not match, the thesis leaves holes (Ma 2011, §3.4), and a scan from one side falls into pieces. Here facets are
 //! taken one by one, those of all three umbrellas first, then the others by size, as long as the whole stays a manifold of two sides
-//! without folds. Needles come last, and facets come in that no umbrella has but whose smallest sphere is empty: on scan lines an umbrella
+//! without folds. Needles come after the others, facets that nothing speaks for only close slits, and facets come in that no umbrella has but whose smallest sphere is empty: on scan lines an umbrella
 //! of the smallest facets is one of points of its own line.
 
 use glam::DVec3;
@@ -16,6 +16,13 @@ use super::star::vertices;
 /// Two triangles that meet at an edge at a lesser angle than this, rad (cosine), are a fold and no surface: 25 degrees.
 const FOLD: f64 = 0.906;
 
+/// A triangle bridges where an edge of it is longer than so many times the typical edges at its ends: a scan line is up to twenty
+/// times denser along than across, and there typical is the longer.
+const BRIDGE: f64 = 4.0;
+/// The same for facets that nothing speaks for but that two of their edges are borders: they close slits and must not creep over holes.
+const FILL: f64 = 1.5;
+/// Level of such facets.
+const FILLS: u32 = 3;
 /// A triangle with an angle above this, rad (cosine), is a needle: 145 degrees.
 const NEEDLE: f64 = -0.82;
 
@@ -29,8 +36,9 @@ struct Sheet<'a> {
     senses: Senses,
 }
 
-/// The triangles of the sheet, all turned alike within each piece. `fits` tells which may be taken.
-pub(super) fn sheet(body: &Body, fits: impl Fn([u32; 3]) -> bool + Sync) -> Vec<[u32; 3]> {
+/// The triangles of the sheet, all turned alike within each piece. `fits` tells which have no edge longer
+/// than so many times the typical ones at its ends.
+pub(super) fn sheet(body: &Body, fits: impl Fn([u32; 3], f64) -> bool + Sync) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
     let mut wanted: Vec<(u32, u32, u32)> = (0..4 * delaunay.cells.len() as u32)
         .into_par_iter()
@@ -38,15 +46,19 @@ pub(super) fn sheet(body: &Body, fits: impl Fn([u32; 3]) -> bool + Sync) -> Vec<
         .filter_map(|f| {
             let matches = body.facets.matches(f);
             let corners = vertices(delaunay, f);
-            let is_known = matches > 0 || body.facets.is_gabriel(f);
-            if !is_known || corners.contains(&GHOST) || !fits(corners) {
+            if corners.contains(&GHOST) || !fits(corners, BRIDGE) {
                 return None;
             }
-            let level = match matches {
-                _ if is_needle(delaunay, corners) => 2,
-                3 => 0,
-                _ => 1,
+            let is_known = matches > 0 || body.facets.is_gabriel(f);
+            let level = match is_needle(delaunay, corners) {
+                false if matches == 3 => 0,
+                false if is_known => 1,
+                true if is_known => 2,
+                _ => FILLS,
             };
+            if level == FILLS && !fits(corners, FILL) {
+                return None;
+            }
             let radius = body.facets.radius(f >> 2, (f & 3) as usize);
             // The bits of a positive number sort as the number does.
             Some((level, radius.to_bits(), f))
@@ -59,8 +71,16 @@ pub(super) fn sheet(body: &Body, fits: impl Fn([u32; 3]) -> bool + Sync) -> Vec<
         triangles: Vec::new(),
         senses: Senses::new(wanted.len()),
     };
-    for (.., facet) in wanted {
-        sheet.try_to_take(vertices(delaunay, facet));
+    for (level, _, facet) in &wanted {
+        sheet.try_to_take(vertices(delaunay, *facet), usize::from(*level == FILLS) * 2);
+    }
+    // A slit closes from its ends.
+    loop {
+        let before = sheet.triangles.len();
+        wanted.retain(|w| !sheet.try_to_take(vertices(delaunay, w.2), 2));
+        if sheet.triangles.len() == before {
+            break;
+        }
     }
     let Sheet {
         mut triangles,
@@ -87,9 +107,10 @@ pub(super) fn is_needle(delaunay: &Delaunay, t: [u32; 3]) -> bool {
 }
 
 impl Sheet<'_> {
-    fn try_to_take(&mut self, t: [u32; 3]) {
+    /// Takes a triangle where there is room for it and at least so many others are beside it; whether it did.
+    fn try_to_take(&mut self, t: [u32; 3], least_beside: usize) -> bool {
         if !(0..3).all(|k| self.has_room(t[k], [t[(k + 1) % 3], t[(k + 2) % 3]])) {
-            return;
+            return false;
         }
         let own = self.triangles.len() as u32;
         let mut joins: Vec<(u32, bool)> = Vec::new();
@@ -101,17 +122,20 @@ impl Sheet<'_> {
             let their = self.triangles[other as usize];
             let far = their.into_iter().find(|v| *v != a && *v != b).unwrap_or(a);
             if self.folds(a, b, apex, far) {
-                return;
+                return false;
             }
             // Neighbours that agree go along their edge in opposite ways.
             let is_alike = (0..3).any(|i| their[i] == b && their[(i + 1) % 3] == a);
             joins.push((other, !is_alike));
         }
+        if joins.len() < least_beside {
+            return false;
+        }
         for (i, (a, a_other)) in joins.iter().enumerate() {
             for (b, b_other) in &joins[..i] {
                 let ((p, p_turned), (q, q_turned)) = (self.senses.of(*a), self.senses.of(*b));
                 if p == q && (p_turned ^ a_other) != (q_turned ^ b_other) {
-                    return;
+                    return false;
                 }
             }
         }
@@ -123,6 +147,7 @@ impl Sheet<'_> {
             self.links[t[k] as usize].push((ends, own));
         }
         self.triangles.push(t);
+        true
     }
 
     /// Whether another triangle at `v` with these other corners leaves fans there, or makes one whole ring.
