@@ -473,15 +473,15 @@ impl Search<'_> {
         let mut parts = fronts.len();
         while parts > 1 {
             let mut open = vec![false; fronts.len()];
-            for i in 0..fronts.len() {
-                let Some(v) = fronts[i].pop_front() else {
+            for (i, front) in fronts.iter_mut().enumerate() {
+                let Some(v) = front.pop_front() else {
                     continue;
                 };
                 self.each_neighbor(v, |u| match number.get(&u) {
                     Some(other) => parts -= usize::from(groups.join(i as u32, *other)),
                     None => {
                         number.insert(u, i as u32);
-                        fronts[i].push_back(u);
+                        front.push_back(u);
                     }
                 });
             }
