@@ -1,6 +1,6 @@
 //! The figures of triangulation, meshes and normals, each row beside the aim or the author's number.
 //!
-//! `cargo bench --bench mesh -- PART...` with the parts `delaunay`, `table52`, `peers`, `normals`, `sharp`, `large`; all but `large` (ten million
+//! `cargo bench --bench mesh -- PART...` with the parts `delaunay`, `table52`, `peers`, `normals`, `sharp`, `open`, `large`; all but `large` (ten million
 //! points) by default. Speeds are also given as ratios to a reference of the same run: twenty neighbours of every point on a k-d tree, one
 //! thread. `PICTURES=FOLDER` writes shaded pictures of the meshes.
 
@@ -170,13 +170,17 @@ fn row(name: &str, points: &[DVec3], genus: i64, settings: Settings) -> Mesh {
         .map(|(n, s)| format!("{n} {s:.2}"))
         .collect();
     println!("    {}", stages.join(", "));
+    picture_of(name, &made);
+    made
+}
+
+fn picture_of(name: &str, made: &Mesh) {
     if let Ok(folder) = std::env::var("PICTURES") {
         let sight = DVec3::new(0.5, 0.7, -0.6);
         let bytes = picture::render(&made.positions, &made.triangles, sight, (1200, 900));
-        let path = format!("{folder}/{}.png", name.replace([' ', '%', '.'], "-"));
+        let path = format!("{folder}/{}.png", name.replace([' ', '%', '.', ':'], "-"));
         println!("    picture {path}: {:?}", std::fs::write(&path, bytes));
     }
-    made
 }
 
 fn head() {
@@ -223,6 +227,25 @@ fn table52() {
     );
 }
 
+/// The edges of the triangulation: no mesh made of it has others.
+fn possible(points: &[DVec3]) -> HashSet<(u32, u32)> {
+    let delaunay = Delaunay::new(points).expect("a body");
+    let source = |v: u32| {
+        delaunay
+            .sources
+            .get(v as usize)
+            .copied()
+            .unwrap_or(u32::MAX)
+    };
+    let ordered = |a: u32, b: u32| (a.min(b), a.max(b));
+    (delaunay.cells.iter())
+        .map(|c| c.map(source))
+        .flat_map(|c| {
+            [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].map(|(i, j)| ordered(c[i], c[j]))
+        })
+        .collect()
+}
+
 /// Links along true edges, for clouds whose points on edges come first and in order.
 ///
 /// Where a point of a face lies too near an edge the link there is no edge of the Delaunay triangulation, and no mesh made of it can have it.
@@ -237,20 +260,7 @@ fn links(made: &Mesh, sampled: &clouds::Sampled) {
             ]
         })
         .collect();
-    let delaunay = Delaunay::new(&sampled.points).expect("a body");
-    let source = |v: u32| {
-        delaunay
-            .sources
-            .get(v as usize)
-            .copied()
-            .unwrap_or(u32::MAX)
-    };
-    let possible: HashSet<(u32, u32)> = (delaunay.cells.iter())
-        .map(|c| c.map(source))
-        .flat_map(|c| {
-            [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)].map(|(i, j)| ordered(c[i], c[j]))
-        })
-        .collect();
+    let possible = possible(&sampled.points);
     let on_edge = sampled.on_edge.iter().filter(|o| **o).count() as u32;
     let along = |i: &u32| {
         let [a, b] = [*i - 1, *i].map(|i| sampled.points[i as usize]);
@@ -377,7 +387,7 @@ fn normal_rows() {
         }
     }
     println!("\nfigures 4.11 and 4.12: torus of 10,000, mean error, rad");
-    println!("noise    one ring  two rings  automatic  plane 30");
+    println!("noise    one ring  two rings  three      automatic  plane 30  chosen");
     let clean = bodies::torus(125, 80);
     for level in [0.0, 0.04, 0.08, 0.12, 0.16, 0.2] {
         // The author's unit: the mean distance to ten neighbours, 1.2 spacings here.
@@ -396,10 +406,12 @@ fn normal_rows() {
             &clean.normals,
         )[0];
         println!(
-            "{level:5.2} {:10.4} {:10.4} {:10.4} {plane:10.4}",
+            "{level:5.2} {:10.4} {:10.4} {:10.4} {:10.4} {plane:10.4}  {:?}",
             error(Rings::One),
             error(Rings::Two),
-            error(Rings::Auto)
+            error(Rings::Three),
+            error(Rings::Auto),
+            normals(&body, &cloud, &neighbors, Rings::Auto).rings,
         );
     }
 }
@@ -446,6 +458,8 @@ fn sharp() {
         rows.extend(labelled(name).map(|found| (name, found)));
     }
     for (name, (points, edges)) in rows {
+        let possible = possible(&points);
+        let most = edges.iter().filter(|e| possible.contains(e)).count();
         for cone in [false, true] {
             let made = mesh(&points, Settings { cone, open: false }).expect("a body");
             let has: HashSet<(u32, u32)> = (made.triangles.iter())
@@ -455,7 +469,7 @@ fn sharp() {
                 .collect();
             let found = edges.iter().filter(|e| has.contains(e)).count();
             println!(
-                "{name:22} cone {cone:5} {found:5} of {:5} {:6.2} %  matched {:.2} %, genus {:?}, {:?}",
+                "{name:22} cone {cone:5} {found:5} of {:5} {:6.2} % ({most} in the triangulation)  matched {:.2} %, genus {:?}, {:?}",
                 edges.len(),
                 100.0 * found as f64 / edges.len() as f64,
                 made.matched_percent(),
@@ -488,6 +502,120 @@ fn labelled(name: &str) -> Option<(Vec<DVec3>, Edges)> {
     Some((points, edges))
 }
 
+/// Scans by lines from one side and from several: how much of what was seen is meshed, in how many pieces, and how long the bridges.
+fn open_scans() {
+    println!("\n--open on scan lines of the block, noise a tenth of the step along a line");
+    println!(
+        "scan                     points    used % area/seen pieces largest % open edges   off      seconds"
+    );
+    let views = [
+        DVec3::new(0.1, 0.05, 1.0),
+        DVec3::new(0.8, 0.3, 0.6),
+        DVec3::new(-0.8, 0.35, 0.6),
+        DVec3::new(0.25, 0.8, 0.6),
+        DVec3::new(-0.3, -0.85, 0.6),
+    ]
+    .map(DVec3::normalize);
+    for ratio in [1.0, 5.0, 10.0, 20.0] {
+        for many in [false, true] {
+            let used = if many { &views[..] } else { &views[..1] };
+            let across = 0.12 * f64::max(ratio, 3.0) * if many { 2.0 } else { 1.0 };
+            let along = across / ratio;
+            let solid = solids::block();
+            let sampled = solid.scan(used, (along, across), 0.1 * along, 3);
+            open_row(
+                &format!("1:{ratio} {} views", used.len()),
+                &solid,
+                &sampled,
+                used,
+                (along, across),
+            );
+        }
+    }
+}
+
+fn open_row(
+    name: &str,
+    solid: &clouds::Solid,
+    sampled: &clouds::Sampled,
+    views: &[DVec3],
+    (along, across): (f64, f64),
+) {
+    let settings = Settings {
+        open: true,
+        ..Settings::default()
+    };
+    let (made, seconds) = timed(|| mesh(&sampled.points, settings).expect("a body"));
+    let t = made.topology;
+    // Every point stands for the part of its face that its ray's step covers; seen from one side only.
+    let seen: f64 = (sampled.points.iter().zip(&sampled.faces))
+        .filter_map(|(p, face)| {
+            let hit = |v: &DVec3| {
+                let (_, n) = solid.faces[usize::from(*face)].hit(*p + *v * 100.0, -*v)?;
+                Some(n.dot(*v).abs())
+            };
+            hit(&views[0])
+        })
+        .map(|cosine| along * across / cosine)
+        .sum();
+    let (mut total, mut off) = (0.0, 0);
+    let mut parent: Vec<u32> = (0..made.positions.len() as u32).collect();
+    fn root(parent: &mut [u32], mut i: u32) -> u32 {
+        while parent[i as usize] != i {
+            parent[i as usize] = parent[parent[i as usize] as usize];
+            i = parent[i as usize];
+        }
+        i
+    }
+    for triangle in &made.triangles {
+        let [a, b, c] = triangle.map(|v| made.positions[v as usize]);
+        total += 0.5 * (b - a).cross(c - a).length();
+        let n = (b - a).cross(c - a).normalize_or_zero();
+        let centre = (a + b + c) / 3.0;
+        let is_near = |way: DVec3| {
+            let hit = |f: &clouds::Face| f.hit(centre + way * 100.0, -way);
+            let off = |(t, _): (f64, DVec3)| (t - 100.0).abs();
+            solid
+                .faces
+                .iter()
+                .filter_map(hit)
+                .map(off)
+                .any(|d| d < 0.5 * across)
+        };
+        off += usize::from(!is_near(n) && !is_near(views[0]));
+        for v in &triangle[1..] {
+            let (i, j) = (root(&mut parent, triangle[0]), root(&mut parent, *v));
+            parent[i.max(j) as usize] = i.min(j);
+        }
+    }
+    let mut sizes = std::collections::HashMap::new();
+    for triangle in &made.triangles {
+        *sizes
+            .entry(root(&mut parent, triangle[0]))
+            .or_insert(0usize) += 1;
+    }
+    let largest = sizes.values().max().copied().unwrap_or(0);
+    println!(
+        "{name:22} {:8} {:9.2} {:8.3} {:6} {:9.2} {:10} {off:8} {seconds:8.2} {}",
+        made.positions.len(),
+        100.0 * t.vertices as f64 / made.positions.len() as f64,
+        if views.len() == 1 {
+            total / seen
+        } else {
+            f64::NAN
+        },
+        t.pieces,
+        100.0 * largest as f64 / made.triangles.len().max(1) as f64,
+        t.open_edges,
+        if t.is_manifold() {
+            "manifold"
+        } else {
+            "NOT manifold"
+        },
+    );
+    picture_of(name, &made);
+}
+
 fn large() {
     println!("\nten million points; aim: below 8 GB");
     let points = solids::block().sample(10_000_000, 0.1, 1).points;
@@ -502,12 +630,13 @@ fn main() {
         .skip(1)
         .filter(|a| !a.starts_with("--"))
         .collect();
-    let parts: [(&str, fn()); 6] = [
+    let parts: [(&str, fn()); 7] = [
         ("delaunay", delaunay),
         ("table52", table52),
         ("peers", peers),
         ("normals", normal_rows),
         ("sharp", sharp),
+        ("open", open_scans),
         ("large", large),
     ];
     for (name, part) in parts {

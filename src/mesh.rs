@@ -4,16 +4,19 @@
 //! neighbours pick the same. What does not come to match is decided by the cells: every umbrella votes which of its cells are inside, and
 //! cells are turned until the surface between inside and outside is a manifold through every point.
 
+mod build;
 pub mod check;
 mod cone;
 mod curve;
 pub mod delaunay;
+mod handles;
 pub mod mend;
 pub mod normals;
 mod open;
 pub mod picture;
 mod predicates;
 pub mod sharpen;
+mod sheet;
 pub mod solid;
 pub mod star;
 pub mod umbrella;
@@ -143,9 +146,10 @@ impl Body {
         let mut solid = vote(&delaunay, &stars, &facets);
         settle(&delaunay, &facets, &mut solid);
         lap("inside");
-        let mending = mend(&delaunay, &stars, &facets, &mut solid);
+        // What closes an open scan is thrown away again: cells as large as the part, at vertices of thousands.
+        let mending = mend(&delaunay, &stars, &facets, &mut solid, !settings.open);
         lap("mend");
-        if settings.cone {
+        if settings.cone && !settings.open {
             sharpen::sharpen(&delaunay, &stars, &mut solid.inside);
         }
         lap("sharpen");

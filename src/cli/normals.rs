@@ -92,7 +92,11 @@ impl NormalsCommand {
                 })?;
                 seconds.extend(body.seconds.iter().copied());
                 let found = normals(&body, &scan.cloud, &neighbors, Rings::Auto);
-                rings = Some(if found.rings == Rings::Two { 2 } else { 1 });
+                rings = Some(match found.rings {
+                    Rings::Two => 2,
+                    Rings::Three => 3,
+                    _ => 1,
+                });
                 by_plane = found.by_plane;
                 found.normals
             }

@@ -1,5 +1,7 @@
 //! The order in which points enter a triangulation: neighbours along a Hilbert curve follow one another.
 
+use std::ops::Range;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -92,9 +94,9 @@ fn spread(x: u32) -> u64 {
     (x | x << 2) & 0x1249_2492_4924_9249
 }
 
-/// Indices below `count` in rounds that each double the density evenly, in ascending order within a round (Amenta, Choi and Rote,
+/// Indices below `count` in rounds that each double the density evenly, in ascending order within a round, and the ranges of the rounds (Amenta, Choi and Rote,
 /// *Incremental constructions con BRIO*, 2003): along a curve alone, scan lines make cavities of unbounded size.
-pub fn in_rounds(count: usize) -> Vec<u32> {
+pub fn in_rounds(count: usize) -> (Vec<u32>, Vec<Range<usize>>) {
     const ROUNDS: usize = 16;
     let round = |i: usize| {
         // The finisher of splitmix64: three of four indices go to the last round.
@@ -110,13 +112,14 @@ pub fn in_rounds(count: usize) -> Vec<u32> {
     for r in 0..ROUNDS {
         starts[r + 1] += starts[r];
     }
+    let rounds = (0..ROUNDS).map(|r| starts[r]..starts[r + 1]).collect();
     let mut order = vec![0; count];
     for i in 0..count {
         let at = &mut starts[ROUNDS - 1 - round(i)];
         order[*at] = i as u32;
         *at += 1;
     }
-    order
+    (order, rounds)
 }
 
 #[cfg(test)]
@@ -148,7 +151,9 @@ mod tests {
         for (i, p) in place.iter().enumerate() {
             assert_eq!(points[distinct[*p as usize] as usize], points[i]);
         }
-        let mut order = in_rounds(5_000);
+        let (mut order, rounds) = in_rounds(5_000);
+        assert!(rounds.iter().all(|r| order[r.clone()].is_sorted()));
+        assert_eq!(rounds.last().map(|r| r.end), Some(5_000));
         assert!(order[..1000].windows(2).filter(|w| w[0] > w[1]).count() < 16);
         order.sort_unstable();
         assert!(order.iter().enumerate().all(|(i, o)| i as u32 == *o));

@@ -3,11 +3,12 @@
 //!
 //! We differ: the thesis has no such step (Ma 2011, §3.4); where it does not converge its mesh has holes.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet, VecDeque};
 
 use rayon::prelude::*;
 
 use super::delaunay::{Delaunay, GHOST};
+use super::handles::short_loops;
 use super::solid::Solid;
 use super::star::{Facets, Stars, corner};
 
@@ -82,8 +83,15 @@ pub(super) fn defect(
 ///
 /// A search around one wrong vertex at a time: of all cells at the wrong vertices the one is turned that leaves the fewest wrong, among equals
 /// the one that votes and sizes speak for. A turned cell rests a while, so that the search leaves blind alleys; what did not lead to fewer
-/// wrong vertices is taken back. One thread; the order is that of the vertices.
-pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Solid) -> Mending {
+/// wrong vertices is taken back. One thread; the order is that of the vertices. Only counted where it is not
+/// wanted.
+pub fn mend(
+    delaunay: &Delaunay,
+    stars: &Stars,
+    facets: &Facets,
+    solid: &mut Solid,
+    is_wanted: bool,
+) -> Mending {
     let count = delaunay.points.len() as u32;
     let inside = &solid.inside;
     let defects: Vec<u8> = (0..count)
@@ -94,6 +102,13 @@ pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Sol
         .collect();
     let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
     let before = wrong.len();
+    if !is_wanted {
+        return Mending {
+            before,
+            after: before,
+            turns: 0,
+        };
+    }
     let mut search = Search {
         delaunay,
         stars,
@@ -105,7 +120,6 @@ pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Sol
         rests: HashMap::new(),
         touched: Vec::new(),
         may_dig: false,
-        pieces_before: 0,
     };
     let mut turns = 0;
     for steps in [20, 60, 200, 600] {
@@ -124,6 +138,10 @@ pub fn mend(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Sol
         }
     }
     turns += search.close_handles();
+    if wrong.is_empty() {
+        turns += search.close_short_handles();
+        turns += search.join_islands();
+    }
     Mending {
         before,
         after: wrong.len(),
@@ -146,11 +164,12 @@ struct Search<'a> {
     touched: Vec<u32>,
     /// Whether a search may begin with a row of cells from its vertex to the other side.
     may_dig: bool,
-    pieces_before: usize,
 }
 
 /// Wrong vertices whose cells are looked at for one turn.
 const LOOKED_AT: usize = 3;
+/// Edges of the longest loop around a handle that samples can have made.
+const LONGEST_LOOP: usize = 10;
 /// Steps for which a turned cell rests: longer than the groups of cells that have to turn together.
 const REST: usize = 12;
 
@@ -195,13 +214,7 @@ impl Search<'_> {
                 (best_sum, best_length) = (sum, self.journal.len());
             }
         }
-        while self.journal.len() > best_length {
-            let Some(cell) = self.journal.pop() else {
-                break;
-            };
-            self.turn(cell);
-            self.journal.pop();
-        }
+        self.take_back(best_length);
         for cell in &self.journal {
             self.touched.extend(self.delaunay.cells[*cell as usize]);
         }
@@ -211,13 +224,19 @@ impl Search<'_> {
     /// Closes handles and voids that no vertex needs: where turning a cell would make the surface smaller but leaves vertices wrong, turns it
     /// and looks whether the rest follows. Kept is what ends with no vertex wrong, fewer triangles and smaller ones.
     fn close_handles(&mut self) -> usize {
+        const STEPS: usize = 16;
         let mut turns = 0;
-        self.pieces_before = self.pieces();
         for _ in 0..4 {
             let mut closed = 0;
             for cell in 0..self.delaunay.cells.len() as u32 {
                 if self.is_blocked(cell) {
-                    closed += self.follow(cell);
+                    let (triangles, growth) = self.follow(cell, STEPS);
+                    let is_less = triangles.is_some_and(|t| t < 0);
+                    if is_less && growth < 0.0 && self.hangs_together() {
+                        closed += self.journal.len();
+                    } else {
+                        self.take_back(0);
+                    }
                 }
             }
             turns += closed;
@@ -228,15 +247,149 @@ impl Search<'_> {
         turns
     }
 
-    /// Pieces of the surface that hang together.
-    fn pieces(&self) -> usize {
+    /// Closes handles that a few edges go around, though the surface gets larger: of all ways to turn cells at a loop the one is kept after which
+    /// it is smallest.
+    ///
+    /// We differ: the thesis only counts handles (Ma 2011, equation 3.2).
+    fn close_short_handles(&mut self) -> usize {
+        const STEPS: usize = 40;
+        /// Cells that are tried in all: a surface with more short handles is no surface of a part.
+        const MOST: usize = 2_000;
+        let (mut turns, mut tries) = (0, 0);
+        for _ in 0..8 {
+            let triangles = super::solid::surface(self.delaunay, &self.solid.inside);
+            let loops = short_loops(self.delaunay.points.len(), &triangles, LONGEST_LOOP);
+            let mut closed = 0;
+            for ring in loops {
+                let mut best: Option<(f32, Vec<u32>)> = None;
+                for cell in self.cells_along(&ring) {
+                    tries += 1;
+                    if tries > MOST {
+                        break;
+                    }
+                    let (triangles, growth) = self.follow(cell, STEPS);
+                    let is_better = best.as_ref().is_none_or(|(least, _)| growth < *least);
+                    let is_less = triangles.is_some_and(|t| t < 0);
+                    if is_less && is_better && self.hangs_together() {
+                        best = Some((growth, self.journal.clone()));
+                    }
+                    self.take_back(0);
+                }
+                for cell in best.map_or(Vec::new(), |b| b.1) {
+                    self.turn(cell);
+                    closed += 1;
+                }
+            }
+            turns += closed;
+            if closed == 0 {
+                break;
+            }
+        }
+        turns
+    }
+
+    /// Joins islands, closed pieces of a few vertices beside the others, to what lies nearest: a row of cells is turned, and what has to follow. Kept
+    /// is what makes one piece of two without a handle.
+    fn join_islands(&mut self) -> usize {
+        /// Vertices of the largest island; more are a body, or a void, of its own.
+        const ISLAND: usize = 100;
         let triangles = super::solid::surface(self.delaunay, &self.solid.inside);
-        let mut groups = super::check::Groups::new(self.delaunay.points.len());
-        let joined = (triangles.iter())
-            .flat_map(|t| [(t[0], t[1]), (t[0], t[2])])
-            .filter(|(a, b)| groups.join(*a, *b))
-            .count();
-        self.delaunay.points.len() - joined
+        let count = self.delaunay.points.len();
+        let mut groups = super::check::Groups::new(count);
+        for t in &triangles {
+            groups.join(t[0], t[1]);
+            groups.join(t[0], t[2]);
+        }
+        let piece: Vec<u32> = (0..count as u32).map(|v| groups.of(v)).collect();
+        let mut sizes = vec![0u32; count];
+        piece.iter().for_each(|p| sizes[*p as usize] += 1);
+        let is_island = |v: u32| sizes[piece[v as usize] as usize] as usize <= ISLAND;
+        let mut turns = 0;
+        let mut joined: Vec<u32> = Vec::new();
+        for v in (0..count as u32).filter(|v| is_island(*v)) {
+            let own = piece[v as usize];
+            if sizes[own as usize] < 4 || joined.contains(&own) {
+                continue;
+            }
+            for inside in [false, true] {
+                let row = self.row_to_other_piece(v, inside, &piece);
+                if !row.is_empty() && self.join_by(&row) {
+                    turns += self.journal.len();
+                    joined.push(own);
+                    break;
+                }
+                self.take_back(0);
+            }
+        }
+        turns
+    }
+
+    /// Turns a row of cells and what has to follow; whether that made one piece of two.
+    fn join_by(&mut self, row: &[u32]) -> bool {
+        const STEPS: usize = 60;
+        self.journal.clear();
+        self.rests.clear();
+        let (last, before) = (row.len() - 1, &row[..row.len() - 1]);
+        let mut triangles = 0;
+        for cell in before {
+            triangles += self.growth_of_turning(*cell).0;
+            self.turn(*cell);
+            self.rests.insert(*cell, usize::MAX);
+        }
+        let (more, _) = self.follow_on(row[last], STEPS);
+        // Two pieces with the same vertices have four triangles less than one.
+        more.is_some_and(|more| triangles + more == 4) && self.hangs_together()
+    }
+
+    /// A shortest row of cells on one side of the surface from `v` to a vertex of another piece, which the last of them has; empty where there is none.
+    fn row_to_other_piece(&self, v: u32, inside: bool, piece: &[u32]) -> Vec<u32> {
+        const MOST: usize = 2_000;
+        let own = piece[v as usize];
+        let goes = |c: u32| self.solid.inside[c as usize] == inside && !self.delaunay.is_ghost(c);
+        let start = self.stars.of(v).iter().map(|code| code >> 2);
+        let mut found: Vec<(u32, usize)> = start
+            .filter(|c| goes(*c))
+            .map(|c| (c, usize::MAX))
+            .collect();
+        let mut seen: HashSet<u32> = found.iter().map(|f| f.0).collect();
+        let mut at = 0;
+        while at < found.len().min(MOST) {
+            let cell = found[at].0;
+            let is_other = |u: &u32| piece[*u as usize] != own;
+            if self.delaunay.cells[cell as usize].iter().any(is_other) {
+                let mut row = Vec::new();
+                let mut from = at;
+                while from != usize::MAX {
+                    row.push(found[from].0);
+                    from = found[from].1;
+                }
+                row.reverse();
+                return row;
+            }
+            for n in self.delaunay.neighbors[cell as usize] {
+                if goes(n) && seen.insert(n) {
+                    found.push((n, at));
+                }
+            }
+            at += 1;
+        }
+        Vec::new()
+    }
+
+    /// Cells with two neighbours of a loop among their corners.
+    fn cells_along(&self, ring: &[u32]) -> Vec<u32> {
+        let mut cells = Vec::new();
+        for (i, &v) in ring.iter().enumerate() {
+            let next = ring[(i + 1) % ring.len()];
+            let own = self.stars.of(v).iter().map(|code| code >> 2);
+            cells.extend(own.filter(|c| {
+                let corners = self.delaunay.cells[*c as usize];
+                corners.contains(&next) && !corners.contains(&GHOST)
+            }));
+        }
+        cells.sort_unstable();
+        cells.dedup();
+        cells
     }
 
     /// Whether turning the cell would make the surface smaller, but not without vertices that are wrong.
@@ -250,15 +403,24 @@ impl Search<'_> {
             && self.change_of_turning(cell) > 0
     }
 
-    /// Turns a cell and what has to follow; the number of turns, none where it came to nothing.
-    fn follow(&mut self, cell: u32) -> usize {
-        const STEPS: usize = 16;
+    /// Turns a cell and what has to follow, into the journal; how many triangles the surface has more, none where vertices stay wrong, and how much
+    /// larger the sum of their radii is.
+    fn follow(&mut self, cell: u32, steps: usize) -> (Option<i32>, f32) {
         self.journal.clear();
         self.rests.clear();
+        self.follow_on(cell, steps)
+    }
+
+    fn follow_on(&mut self, cell: u32, steps: usize) -> (Option<i32>, f32) {
         let (mut triangles, mut growth) = (0, 0.0);
         let mut wrong: Vec<u32> = Vec::new();
+        for turned in &self.journal {
+            wrong.extend(self.delaunay.cells[*turned as usize]);
+        }
+        wrong.sort_unstable();
+        wrong.dedup();
         let mut next = Some(cell);
-        for step in 0..STEPS {
+        for step in 0..steps {
             let Some(cell) = next else { break };
             let grown = self.growth_of_turning(cell);
             (triangles, growth) = (triangles + grown.0, growth + grown.1);
@@ -271,7 +433,7 @@ impl Search<'_> {
             }
             wrong.retain(|w| self.defects[*w as usize] > 0);
             if wrong.is_empty() {
-                break;
+                return (Some(triangles), growth);
             }
             let mut best: Option<(i32, f32, u32)> = None;
             for w in wrong.iter().rev().take(LOOKED_AT) {
@@ -279,19 +441,76 @@ impl Search<'_> {
             }
             next = best.map(|b| b.2);
         }
-        if wrong.is_empty() && triangles < 0 && growth < 0.0 {
-            // Fewer triangles with the same vertices: a handle less, or a piece more.
-            let pieces = self.pieces();
-            if pieces <= self.pieces_before {
-                self.pieces_before = pieces;
-                return self.journal.len();
-            }
-        }
-        while let Some(cell) = self.journal.pop() {
+        (None, growth)
+    }
+
+    /// Turns the cells of the journal back until `length` are left.
+    fn take_back(&mut self, length: usize) {
+        while self.journal.len() > length {
+            let Some(cell) = self.journal.pop() else {
+                return;
+            };
             self.turn(cell);
             self.journal.pop();
         }
-        0
+    }
+
+    /// Whether the surface at the cells of the journal is one piece: fewer triangles with the same vertices are a handle less, or a piece more.
+    ///
+    /// Looks around all their corners in turn until all have met, or one has no further to go.
+    fn hangs_together(&self) -> bool {
+        let mut number: HashMap<u32, u32> = HashMap::new();
+        let mut fronts: Vec<VecDeque<u32>> = Vec::new();
+        for cell in &self.journal {
+            for v in self.delaunay.cells[*cell as usize] {
+                number.entry(v).or_insert_with(|| {
+                    fronts.push(VecDeque::from([v]));
+                    fronts.len() as u32 - 1
+                });
+            }
+        }
+        let mut groups = super::check::Groups::new(fronts.len());
+        let mut parts = fronts.len();
+        while parts > 1 {
+            let mut open = vec![false; fronts.len()];
+            for (i, front) in fronts.iter_mut().enumerate() {
+                let Some(v) = front.pop_front() else {
+                    continue;
+                };
+                self.each_neighbor(v, |u| match number.get(&u) {
+                    Some(other) => parts -= usize::from(groups.join(i as u32, *other)),
+                    None => {
+                        number.insert(u, i as u32);
+                        front.push_back(u);
+                    }
+                });
+            }
+            for (i, front) in fronts.iter().enumerate() {
+                open[groups.of(i as u32) as usize] |= !front.is_empty();
+            }
+            if parts > 1 && (0..fronts.len()).any(|i| groups.of(i as u32) == i as u32 && !open[i]) {
+                return false;
+            }
+        }
+        true
+    }
+
+    /// Calls `with` for the other corners of the surface's triangles at `v`.
+    fn each_neighbor(&self, v: u32, mut with: impl FnMut(u32)) {
+        for code in self.stars.of(v) {
+            let (cell, own) = corner(*code);
+            if !self.solid.inside[cell as usize] {
+                continue;
+            }
+            for at in (0..4).filter(|at| *at != own) {
+                if !self.solid.inside[self.delaunay.neighbors[cell as usize][at] as usize] {
+                    let corners = self.delaunay.cells[cell as usize];
+                    (0..4)
+                        .filter(|k| *k != at && *k != own)
+                        .for_each(|k| with(corners[k]));
+                }
+            }
+        }
     }
 
     /// How many triangles the surface has more after turning a cell, and how much larger the sum of their radii is.
@@ -318,7 +537,7 @@ impl Search<'_> {
             return Vec::new();
         }
         let mut found: Vec<(u32, usize)> = Vec::new();
-        let mut seen: std::collections::HashSet<u32> = std::collections::HashSet::new();
+        let mut seen: HashSet<u32> = HashSet::new();
         for code in star {
             if !self.delaunay.is_ghost(code >> 2) && seen.insert(code >> 2) {
                 found.push((code >> 2, usize::MAX));

@@ -18,7 +18,9 @@ pub enum Rings {
     One,
     /// And those at their corners.
     Two,
-    /// One or two, by the noise of the points.
+    /// The points of three rings, under noise that leaves triangles no direction.
+    Three,
+    /// One or three, by the noise of the points.
     Auto,
 }
 
@@ -33,9 +35,9 @@ pub struct Normals {
     pub by_plane: usize,
 }
 
-/// Noise over spacing from which on two rings are taken: on a torus of ten thousand points one ring is better without noise, two from 0.03
-/// on.
-const TWO_RINGS_FROM: f64 = 0.02;
+/// Noise over spacing from which on three rings are taken: on a torus of ten thousand points one ring is best without noise, three from 0.015 on.
+/// Two are best between, but so little noise cannot be told from the bend of a surface.
+const THREE_RINGS_FROM: f64 = 0.02;
 /// Facets of the second ring that turn by more than this, rad (cosine), from the first lie beyond an edge.
 const BEYOND_EDGE: f64 = 0.82;
 /// Neighbours of the weighted plane (Ma 2011, §4.4.2).
@@ -46,15 +48,14 @@ const PLANE_NEIGHBOURS: usize = 40;
 /// We differ: the thesis takes the facets of an umbrella whether its neighbours have them or not, weighted by matching index times angle (Ma
 /// 2011, equation 4.6), and a plane where fewer than three match. Here every vertex has the closed ring of the mesh; facets that
 /// matching alone found weigh their index, the others one. Where the surface turns smoothly and points are clean, that
-/// normal is corrected by a cubic through two rings. The plane remains for points without triangles. Orientation needs no
-/// propagation: the body has an outside. Whether one ring or two follows from the noise of the points, not from the user.
+/// normal is corrected by a cubic through two rings; under strong noise it is that of a quadric through three. The plane remains for points without triangles. Orientation needs no
+/// propagation: the body has an outside. How many rings follows from the noise of the points, not from the user.
 pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Rings) -> Normals {
     let rings = match rings {
         Rings::Auto => {
             let spacing = spacing(cloud, neighbors);
-            let noise = noise_mm(cloud, neighbors, &spacing);
-            if noise > TWO_RINGS_FROM * spacing.mean_mm {
-                Rings::Two
+            if noise_mm(cloud, neighbors, &spacing) > THREE_RINGS_FROM * spacing.mean_mm {
+                Rings::Three
             } else {
                 Rings::One
             }
@@ -71,6 +72,16 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
             .into_par_iter()
             .map(|v| two_rings(body, v, &one).as_vec3())
             .collect(),
+        Rings::Three => {
+            let two: Vec<DVec3> = (0..count)
+                .into_par_iter()
+                .map(|v| two_rings(body, v, &one))
+                .collect();
+            (0..count)
+                .into_par_iter()
+                .map(|v| quadric(body, v, &two).unwrap_or(two[v as usize]).as_vec3())
+                .collect()
+        }
         _ => (0..count)
             .into_par_iter()
             .map(|v| cubic(body, v, &one).unwrap_or(one[v as usize]).as_vec3())
@@ -97,9 +108,8 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
     }
 }
 
-/// Calls `with` for every triangle of the surface at `v`: its outward normal (twice the area long), its angle at `v`, rad, other
-/// corners, and facet.
-fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, f64, [u32; 2], u32)) {
+/// Calls `with` for every triangle of the surface at `v`: its outward normal (twice the area long), other corners, and facet.
+fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, [u32; 2], u32)) {
     let delaunay = &body.delaunay;
     for code in body.stars.of(v) {
         let (cell, own) = corner(*code);
@@ -116,23 +126,18 @@ fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, f64, [u32; 2], 
             let normal = (b - a).cross(c - a);
             let at_v = corners.iter().position(|u| *u == v).unwrap_or(0);
             let others = [corners[(at_v + 1) % 3], corners[(at_v + 2) % 3]];
-            let p = delaunay.points[v as usize];
-            let [u, w] = others.map(|u| delaunay.points[u as usize] - p);
-            let angle = u.cross(w).length().atan2(u.dot(w));
-            with(normal, angle, others, facet(delaunay, cell, at));
+            with(normal, others, facet(delaunay, cell, at));
         }
     }
 }
 
-/// Outward normals of the triangles at `v`, weighted by matching index times angle (Ma 2011, equation 4.6).
+/// Outward normals of the triangles at `v`, weighted by matching index times area.
+///
+/// We differ: the thesis weighs by angle (Ma 2011, equation 4.6); on a torus, where normals are known, areas leave half of its error.
 fn ring_sum(body: &Body, v: u32) -> DVec3 {
     let mut sum = DVec3::ZERO;
-    triangles_at(body, v, |normal, angle, _, facet| {
-        let matches = f64::from(body.facets.matches(facet).max(1));
-        let term = normal.normalize_or_zero() * (matches * angle);
-        if term.is_finite() {
-            sum += term;
-        }
+    triangles_at(body, v, |normal, _, facet| {
+        sum += normal * f64::from(body.facets.matches(facet).max(1));
     });
     sum
 }
@@ -145,9 +150,9 @@ fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
     const STEEPEST: f64 = 0.3;
     let own = one[v as usize];
     let mut around = Vec::new();
-    triangles_at(body, v, |_, _, others, _| around.extend(others));
+    triangles_at(body, v, |_, others, _| around.extend(others));
     for i in 0..around.len() {
-        triangles_at(body, around[i], |_, _, others, _| around.extend(others));
+        triangles_at(body, around[i], |_, others, _| around.extend(others));
     }
     around.sort_unstable();
     around.dedup();
@@ -193,18 +198,60 @@ fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
 fn two_rings(body: &Body, v: u32, one: &[DVec3]) -> DVec3 {
     let own = one[v as usize];
     let mut around = vec![v];
-    triangles_at(body, v, |_, _, others, _| around.extend(others));
+    triangles_at(body, v, |_, others, _| around.extend(others));
     around.sort_unstable();
     around.dedup();
     let mut sum = DVec3::ZERO;
     for u in around {
-        triangles_at(body, u, |normal, _, _, _| {
+        triangles_at(body, u, |normal, _, _| {
             if normal.normalize_or_zero().dot(own) > BEYOND_EDGE {
                 sum += normal;
             }
         });
     }
     sum.try_normalize().unwrap_or(own)
+}
+
+/// The normal of the quadric height function over the points of three rings around `v`, those beyond an edge left out, or none where there are too
+/// few.
+///
+/// We differ: the thesis takes triangles of two rings under noise and still falls behind planes through neighbours where it is strong (Ma 2011,
+/// figures 4.11 and 4.12); the rings of the mesh keep apart what lies on two sides of a wall or an edge, and the fit averages as
+/// many points as planes do.
+fn quadric(body: &Body, v: u32, two: &[DVec3]) -> Option<DVec3> {
+    const LEAST_POINTS: usize = 12;
+    const RINGS: usize = 3;
+    let own = two[v as usize];
+    let mut around = vec![v];
+    let mut done = 0;
+    for _ in 0..RINGS {
+        let reached = around.len();
+        for i in done..reached {
+            triangles_at(body, around[i], |_, others, _| {
+                for u in others {
+                    if two[u as usize].dot(own) > BEYOND_EDGE && !around.contains(&u) {
+                        around.push(u);
+                    }
+                }
+            });
+        }
+        done = reached;
+    }
+    if around.len() < LEAST_POINTS {
+        return None;
+    }
+    let p = body.delaunay.points[v as usize];
+    let x = own.any_orthonormal_vector();
+    let y = own.cross(x);
+    let ways = around.iter().map(|u| body.delaunay.points[*u as usize] - p);
+    let reach = ways.clone().map(|d| d.length()).fold(0.0, f64::max);
+    let mut sums = NormalSums::<6>::default();
+    for d in ways {
+        let (a, b) = (d.dot(x) / reach, d.dot(y) / reach);
+        sums.add(&[a, b, 1.0, a * a, a * b, b * b], d.dot(own) / reach, 1.0);
+    }
+    let ([a, b, ..], _) = sums.solve()?;
+    Some((own - x * a - y * b).normalize())
 }
 
 /// Turns `normals` to one sense: along the edges of the graph of nearest neighbours, the most parallel first (Hoppe et al. 1992; Ma 2011,

@@ -1,96 +1,41 @@
-//! Surfaces with borders: the part of a closed surface that was seen.
+//! Surfaces with borders: what of a part was seen.
 //!
 //! A scan is open nearly always. Closed, its mesh bridges what was never seen by triangles far larger than the spacing around; these are
-//! left out. Of a sheet, which bounds no body, the matched facets are taken, as the thesis leaves them (Ma 2011, §3.4).
+//! left out. A sheet, which bounds no body, is grown from the umbrellas ([`super::sheet`]).
 
 use std::collections::HashMap;
 
 use super::Body;
 use super::delaunay::{Delaunay, GHOST};
-use super::solid::surface;
+use super::sheet::{is_needle, sheet};
 use super::star::vertices;
 
-/// A triangle bridges where an edge of it is longer than so many times the typical edges at its ends: a scan line is up to twenty
-/// times denser along than across, and there typical is the longer.
-const BRIDGE: f64 = 4.0;
-/// Share of wrong vertices after the vote from which on the points are no body.
-const SHEET: f64 = 0.05;
+/// An edge longer than so many times the typical ones of nine in ten vertices bridges whatever its surroundings.
+const LONGEST: f64 = 4.0;
 
-/// The triangles of the body's surface that bridge nothing, as a manifold with borders.
+/// The triangles of the points' surface that bridge nothing, as a manifold with borders.
 pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
-    let is_sheet = body.mending.before as f64 > SHEET * delaunay.points.len() as f64;
-    let mut triangles = if is_sheet {
-        oriented(matched(body))
-    } else {
-        surface(delaunay, &body.solid.inside)
-    };
-    let typical = typical_edges(delaunay, &triangles);
+    let typical = typical_edges(delaunay, &sure(body));
     let most = longest_seen(&typical);
-    triangles.retain(|t| {
+    let is_seen = |t: [u32; 3], times: f64| {
         (0..3).all(|k| {
             let (a, b) = (t[k], t[(k + 1) % 3]);
             let length = delaunay.points[a as usize].distance(delaunay.points[b as usize]);
-            length <= (BRIDGE * typical[a as usize].min(typical[b as usize])).min(most)
+            length <= (times * typical[a as usize].min(typical[b as usize])).min(most)
         })
-    });
-    one_fan_each(delaunay.points.len(), triangles)
+    };
+    one_fan_each(delaunay.points.len(), sheet(body, is_seen))
 }
 
-fn matched(body: &Body) -> Vec<[u32; 3]> {
+/// The facets whose smallest sphere is empty, needles left out: nearly all are on the surface.
+fn sure(body: &Body) -> Vec<[u32; 3]> {
     let delaunay = &body.delaunay;
     (0..4 * delaunay.cells.len() as u32)
-        .filter(|f| delaunay.neighbors[(f >> 2) as usize][(f & 3) as usize] > f >> 2)
-        .filter(|f| body.facets.matches(*f) == 3)
+        .filter(|f| body.facets.is_gabriel(*f))
         .map(|f| vertices(delaunay, f))
-        .filter(|t| !t.contains(&GHOST))
+        .filter(|t| !t.contains(&GHOST) && !is_needle(delaunay, *t))
         .collect()
-}
-
-/// The triangles with neighbours turned alike, from the first of every piece on.
-fn oriented(mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
-    let mut at: HashMap<(u32, u32), Vec<u32>> = HashMap::with_capacity(2 * triangles.len());
-    for (i, t) in triangles.iter().enumerate() {
-        for k in 0..3 {
-            let (a, b) = (t[k], t[(k + 1) % 3]);
-            at.entry((a.min(b), a.max(b))).or_default().push(i as u32);
-        }
-    }
-    let mut is_done = vec![false; triangles.len()];
-    let mut stack = Vec::new();
-    for start in 0..triangles.len() {
-        if std::mem::replace(&mut is_done[start], true) {
-            continue;
-        }
-        stack.push(start);
-        while let Some(i) = stack.pop() {
-            let t = triangles[i];
-            for k in 0..3 {
-                let (a, b) = (t[k], t[(k + 1) % 3]);
-                for &j in &at[&(a.min(b), a.max(b))] {
-                    let j = j as usize;
-                    if !std::mem::replace(&mut is_done[j], true) {
-                        let other = &mut triangles[j];
-                        if (0..3).any(|k| other[k] == a && other[(k + 1) % 3] == b) {
-                            other.swap(0, 1);
-                        }
-                        stack.push(j);
-                    }
-                }
-            }
-        }
-    }
-    // What could not be turned alike parts at its edges.
-    let mut seen: HashMap<(u32, u32), ()> = HashMap::new();
-    triangles.retain(|t| {
-        let sides = [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])];
-        let is_new = sides.iter().all(|s| !seen.contains_key(s));
-        if is_new {
-            seen.extend(sides.map(|s| (s, ())));
-        }
-        is_new
-    });
-    triangles
 }
 
 /// For every vertex the median of the lengths of its triangles' edges.
@@ -121,7 +66,7 @@ fn longest_seen(typical: &[f64]) -> f64 {
         return f64::INFINITY;
     }
     let at = (all.len() - 1) * 9 / 10;
-    BRIDGE * *all.select_nth_unstable_by(at, f64::total_cmp).1
+    LONGEST * *all.select_nth_unstable_by(at, f64::total_cmp).1
 }
 
 /// Leaves every vertex one fan or ring of triangles, the largest.

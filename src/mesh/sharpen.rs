@@ -1,9 +1,9 @@
 //! Edges of the mesh laid along the sharp edges of the part.
 //!
 //! We differ: the cone of the thesis works only while umbrellas are matched, and takes part only where they do not match at once (Ma 2011,
-//! §5.4.3). Afterwards an edge between two triangles is exchanged for the other diagonal of the two, where a cell fills the
-//! four corners, if that gathers the bends of the surface on fewer and shorter edges. The mesh stays made of Delaunay facets: it
-//! cannot cross itself.
+//! §5.4.3). Afterwards cells are turned, one or two neighbours at a time, where that gathers the bends of the surface on fewer and shorter
+//! edges: one cell that fills the four corners of two triangles exchanges their diagonal. The mesh stays made of Delaunay facets: it cannot
+//! cross itself.
 
 use glam::DVec3;
 
@@ -15,41 +15,45 @@ use super::star::Stars;
 const MOST_ROUNDS: usize = 8;
 /// A change gains at least this share of the bends it touches: less is rounding.
 const LEAST_GAIN: f64 = 1e-6;
+/// Two cells are tried together where the surface turns by at least this angle, rad: on a smooth surface one cell is enough.
+const SHARP: f64 = 0.35;
 
-/// Exchanges diagonals until none gains; the number exchanged.
+/// Turns cells until none gains; the number of changes.
 pub fn sharpen(delaunay: &Delaunay, stars: &Stars, inside: &mut [bool]) -> usize {
-    let mut ring = Ring::default();
-    let mut exchanged = 0;
+    let mut work = Work {
+        delaunay,
+        stars,
+        inside,
+        ring: Ring::default(),
+        edges: Vec::new(),
+        corners: Vec::new(),
+    };
+    let mut changed = 0;
     let mut cells: Vec<u32> = (0..delaunay.cells.len() as u32)
-        .filter(|c| !delaunay.cells[*c as usize].contains(&GHOST))
+        .filter(|c| !delaunay.is_ghost(*c))
         .collect();
     for _ in 0..MOST_ROUNDS {
         let mut next = Vec::new();
         for &cell in &cells {
-            let Some(quad) = Quad::of(delaunay, inside, cell) else {
-                continue;
-            };
-            if quad.gain(delaunay, inside) <= LEAST_GAIN {
+            let exposed = work.exposed(cell);
+            if exposed == 0 {
                 continue;
             }
-            let corners = delaunay.cells[cell as usize];
-            if corners
-                .iter()
-                .any(|v| defect(delaunay, stars, inside, *v, &mut ring) > 0)
-            {
-                continue;
+            let mut turned = exposed == 2 && work.try_turning(&[cell]);
+            if !turned && work.is_sharp_at(cell) {
+                let side = work.inside[cell as usize];
+                let beside = delaunay.neighbors[cell as usize];
+                turned = beside.into_iter().any(|n| {
+                    !delaunay.is_ghost(n)
+                        && work.inside[n as usize] == side
+                        && work.try_turning(&[cell, n])
+                });
             }
-            inside[cell as usize] ^= true;
-            if corners
-                .iter()
-                .any(|v| defect(delaunay, stars, inside, *v, &mut ring) > 0)
-            {
-                inside[cell as usize] ^= true;
-                continue;
-            }
-            exchanged += 1;
-            for v in corners {
-                next.extend(stars.of(v).iter().map(|code| code >> 2));
+            if turned {
+                changed += 1;
+                for v in delaunay.cells[cell as usize] {
+                    next.extend(stars.of(v).iter().map(|code| code >> 2));
+                }
             }
         }
         if next.is_empty() {
@@ -57,73 +61,142 @@ pub fn sharpen(delaunay: &Delaunay, stars: &Stars, inside: &mut [bool]) -> usize
         }
         next.sort_unstable();
         next.dedup();
-        next.retain(|c| !delaunay.cells[*c as usize].contains(&GHOST));
+        next.retain(|c| !delaunay.is_ghost(*c));
         cells = next;
     }
-    exchanged
+    changed
 }
 
-/// A cell with two facets on the surface, which meet at the edge `old`; its other two facets meet at the edge `new`.
-struct Quad {
-    cell: u32,
-    /// Places of corners in the cell.
-    old: [usize; 2],
-    new: [usize; 2],
+struct Work<'a> {
+    delaunay: &'a Delaunay,
+    stars: &'a Stars,
+    inside: &'a mut [bool],
+    ring: Ring,
+    /// Edges at stake: a cell and the places of their ends in it.
+    edges: Vec<((u32, u32), u32, [usize; 2])>,
+    corners: Vec<u32>,
 }
 
-impl Quad {
-    fn of(delaunay: &Delaunay, inside: &[bool], cell: u32) -> Option<Self> {
-        let own = inside[cell as usize];
-        let neighbors = delaunay.neighbors[cell as usize];
-        let on_surface = neighbors.map(|n| inside[n as usize] != own);
-        if on_surface.iter().filter(|s| **s).count() != 2 {
-            return None;
-        }
-        // The facets opposite to the ends of `new` are on the surface.
-        let (mut old, mut new) = ([0; 2], [0; 2]);
-        let (mut o, mut n) = (0, 0);
-        for (at, is_on) in on_surface.into_iter().enumerate() {
-            if is_on {
-                new[n] = at;
-                n += 1;
-            } else {
-                old[o] = at;
-                o += 1;
-            }
-        }
-        Some(Self { cell, old, new })
+impl Work<'_> {
+    /// Facets of a cell that are on the surface.
+    fn exposed(&self, cell: u32) -> usize {
+        let own = self.inside[cell as usize];
+        let beside = self.delaunay.neighbors[cell as usize];
+        beside
+            .iter()
+            .filter(|n| self.inside[**n as usize] != own)
+            .count()
     }
 
-    /// By what share the bends of the edges at stake are less after the exchange.
-    fn gain(&self, delaunay: &Delaunay, inside: &[bool]) -> f64 {
-        let corners = delaunay.cells[self.cell as usize];
-        let at = |v: u32| delaunay.points[v as usize];
-        let [r, s] = self.old.map(|k| corners[k]);
-        let [p, q] = self.new.map(|k| corners[k]);
-        let mut before = bend(at(r), at(s), at(p), at(q));
-        let mut after = bend(at(p), at(q), at(r), at(s));
-        for (i, own) in [(0, r), (1, s)] {
-            for (j, other) in [(0, p), (1, q)] {
-                // The surface's facet at this edge is opposite to the other end of `new`.
-                let facet = self.new[1 - j];
-                let beyond = across_edge(
-                    delaunay,
-                    inside,
-                    self.cell,
-                    facet,
-                    own,
-                    other,
-                    corners[self.old[1 - i]],
-                );
-                before += bend(at(own), at(other), at(corners[self.old[1 - i]]), at(beyond));
-                after += bend(at(own), at(other), at(corners[self.new[1 - j]]), at(beyond));
+    /// Whether the surface turns sharply at an edge of the cell.
+    fn is_sharp_at(&self, cell: u32) -> bool {
+        let length = |w: &Self, i: usize, j: usize| {
+            let [a, b] = [i, j].map(|k| w.delaunay.cells[cell as usize][k]);
+            w.delaunay.points[a as usize].distance(w.delaunay.points[b as usize])
+        };
+        let own = self.inside[cell as usize];
+        let beside = self.delaunay.neighbors[cell as usize];
+        let is_exposed = beside.map(|n| self.inside[n as usize] != own);
+        (0..4).any(|i| {
+            (0..i).any(|j| {
+                if !(0..4).any(|k| k != i && k != j && is_exposed[k]) {
+                    return false;
+                }
+                let bend = self.bend_at(cell, [i, j]);
+                bend.is_some_and(|b| b > SHARP.sqrt() * length(self, i, j))
+            })
+        })
+    }
+
+    /// Turns cells if that leaves all vertices right and the bends less.
+    fn try_turning(&mut self, cells: &[u32]) -> bool {
+        self.edges.clear();
+        self.corners.clear();
+        for &cell in cells {
+            let corners = self.delaunay.cells[cell as usize];
+            self.corners.extend(corners);
+            for i in 0..4 {
+                for j in 0..i {
+                    let (a, b) = (corners[i].min(corners[j]), corners[i].max(corners[j]));
+                    self.edges.push(((a, b), cell, [i, j]));
+                }
             }
         }
-        if before > 0.0 {
-            (before - after) / before
-        } else {
-            0.0
+        self.edges.sort_unstable();
+        self.edges.dedup_by_key(|e| e.0);
+        self.corners.sort_unstable();
+        self.corners.dedup();
+        let Some(before) = self.bends() else {
+            return false;
+        };
+        self.flip(cells);
+        let after = self.bends();
+        let gains = after.is_some_and(|after| before - after > LEAST_GAIN * before);
+        if gains && self.are_right() {
+            // Vertices that were wrong before stay as they are.
+            self.flip(cells);
+            let were_right = self.are_right();
+            if were_right {
+                self.flip(cells);
+            }
+            return were_right;
         }
+        self.flip(cells);
+        false
+    }
+
+    fn flip(&mut self, cells: &[u32]) {
+        for &cell in cells {
+            self.inside[cell as usize] ^= true;
+        }
+    }
+
+    fn are_right(&mut self) -> bool {
+        let (ring, inside) = (&mut self.ring, &*self.inside);
+        let mut corners = self.corners.iter();
+        corners.all(|v| defect(self.delaunay, self.stars, inside, *v, ring) == 0)
+    }
+
+    /// Sum of the bends of the edges at stake, or none where more than two triangles meet at one.
+    fn bends(&self) -> Option<f64> {
+        let each = |e: &((u32, u32), u32, [usize; 2])| self.bend_at(e.1, e.2);
+        self.edges.iter().map(each).sum()
+    }
+
+    /// The bend of the surface at the edge between two corners of a cell: 0 where it is not on the surface, none where more than two triangles meet.
+    fn bend_at(&self, cell: u32, ends: [usize; 2]) -> Option<f64> {
+        let [a, b] = ends.map(|k| self.delaunay.cells[cell as usize][k]);
+        let mut thirds = [GHOST; 2];
+        let mut found = 0;
+        // Around the edge: out of each cell by the facet that it was not entered by.
+        let mut enter = (0..4).find(|k| !ends.contains(k))?;
+        let mut at = cell;
+        loop {
+            let corners = self.delaunay.cells[at as usize];
+            let exit = (0..4).find(|k| *k != enter && corners[*k] != a && corners[*k] != b)?;
+            let next = self.delaunay.neighbors[at as usize][exit];
+            if self.inside[at as usize] != self.inside[next as usize] {
+                if found == 2 {
+                    return None;
+                }
+                // The facet opposite `exit` has the corner entered opposite to.
+                thirds[found] = corners[enter];
+                found += 1;
+            }
+            // The facet shared has `corners[enter]`; in the next cell the one to leave by is opposite to it.
+            let shared = corners[enter];
+            enter = self.delaunay.mirror(at, next);
+            debug_assert!(self.delaunay.cells[next as usize].contains(&shared));
+            at = next;
+            if at == cell {
+                break;
+            }
+        }
+        if found == 0 {
+            return Some(0.0);
+        }
+        let point = |v: u32| self.delaunay.points[v as usize];
+        Some(bend(point(a), point(b), point(thirds[0]), point(thirds[1])))
     }
 }
 
@@ -135,35 +208,6 @@ fn bend(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> f64 {
     let (m, n) = (along.cross(c - a), (-along).cross(d - b));
     let angle = m.cross(n).length().atan2(m.dot(n));
     along.length() * angle.sqrt()
-}
-
-/// The third corner of the other surface triangle at edge `a` `b` of the surface facet opposite corner `at` of `cell`, whose third corner is `third`.
-fn across_edge(
-    delaunay: &Delaunay,
-    inside: &[bool],
-    cell: u32,
-    at: usize,
-    a: u32,
-    b: u32,
-    third: u32,
-) -> u32 {
-    debug_assert!(a != b && third != a && third != b);
-    let mut n = delaunay.neighbors[cell as usize][at];
-    let beyond = inside[n as usize];
-    let mut third = third;
-    let mut facet = delaunay.mirror(cell, n);
-    loop {
-        let corners = delaunay.cells[n as usize];
-        let across = corners[facet];
-        let exit = corners.iter().position(|c| *c == third).unwrap_or(facet);
-        let next = delaunay.neighbors[n as usize][exit];
-        third = across;
-        if inside[next as usize] != beyond {
-            return third;
-        }
-        facet = delaunay.mirror(n, next);
-        n = next;
-    }
 }
 
 #[cfg(test)]
