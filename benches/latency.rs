@@ -141,12 +141,20 @@ fn in_the_daemon(cell: Cell, folder: &Path, rounds: usize) {
             );
         }
         println!(
-            "    {round}: {latency:.3} s, {:.1} % of the scan, processor {:.2} cores during the scan",
+            "    {round}: {latency:.3} s ({:.3} to the values, the rest report and store), {:.1} % of the scan, processor {:.2} cores during the scan",
+            kept.verdict_seconds.unwrap_or(f64::NAN),
             100.0 * latency / scan,
             busy / scan
         );
         seconds.push(latency);
     }
+    let last = handle.snapshot().last.as_ref().map(|last| last.id);
+    let report = last.and_then(|id| handle.store().report_json(id).ok());
+    let report: Option<serde_json::Value> = report.and_then(|r| serde_json::from_str(&r).ok());
+    println!(
+        "    the last one by stage, s: {}",
+        report.map_or("?".to_owned(), |r| r["seconds"].to_string())
+    );
     seconds.sort_by(f64::total_cmp);
     println!(
         "{rounds} rounds: verdict {:.3} s after the last profile (median), {:.3} s (worst)",

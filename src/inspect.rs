@@ -161,13 +161,14 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let mut patches = Patches::default();
     patches.add(&part.positions, &places, &outline);
     let scanned = Scanned {
-        clouds: &[&part],
+        clouds: &[(&part, None)],
         patches: &patches,
         outline: &outline,
         spacing: scan.spacing,
         noise_mm: scan.noise_mm,
     };
-    let compared = compare::compare(&scanned, (&edges, &measured));
+    let found = compare::look(&scanned);
+    let compared = compare::compare(&scanned, found, (&edges, &measured));
     let taken = Taken {
         alignment,
         findings,

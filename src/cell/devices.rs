@@ -5,7 +5,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use acies_drivers::device::{Identity, Instrument, Setup};
+use acies_drivers::device::{Identity, Instrument, Presence, Setup};
 use acies_drivers::link::Links;
 
 pub(super) use crate::acquire::chain;
@@ -153,7 +153,7 @@ fn look_after(
 
 /// How the time with an open device ended.
 enum Kept {
-    /// It should be opened anew, to see whether it is still there.
+    /// It should be opened anew, to see whether it is still there: it did not say so itself.
     Check,
     /// It is gone.
     Lost,
@@ -179,7 +179,11 @@ fn keep(instrument: Instrument, requests: &Receiver<Request>) -> Kept {
             Ok(Request::Return(Some(instrument))) => held = Some(instrument),
             Ok(Request::Return(None)) => return Kept::Lost,
             Ok(Request::Retry) => {}
-            Err(RecvTimeoutError::Timeout) => return Kept::Check,
+            Err(RecvTimeoutError::Timeout) => match held.as_mut().map(Instrument::check) {
+                Some(Ok(Presence::Answered)) => {}
+                // Opening it anew tells, and says why where it is gone.
+                _ => return Kept::Check,
+            },
             Err(RecvTimeoutError::Disconnected) => return Kept::End,
         }
     }

@@ -18,16 +18,20 @@ use crate::nominal::Nominal;
 use crate::points::{Frame, Origin, PointCloud, View};
 
 /// Points that are handed over together: a tree over them pays, and little is left when the scan ends.
-const PIECE: usize = 20_000;
+const PIECE: usize = 12_000;
 
 /// How often edges are measured at most: as often as people can follow.
 const MEASURE_EVERY: Duration = Duration::from_millis(700);
+
+/// Share of the scan after which the edges are not looked at before it has ended.
+const LAST_LOOK: f64 = 0.96;
 
 /// Who is shown the edges as they come.
 pub(super) type Show = Box<dyn Fn(Vec<EdgeSoFar>) + Send>;
 
 enum Message {
-    Piece(PointCloud),
+    /// Points, and what share of the scan has been done.
+    Piece(PointCloud, f64),
     /// The scan has ended with so many points.
     End(usize),
 }
@@ -95,9 +99,10 @@ fn follow(
             }
         };
         match message {
-            Message::Piece(piece) => {
+            Message::Piece(piece, share) => {
                 growing.push(piece);
-                fresh = growing.is_placed();
+                // What is looked at now would keep the verdict waiting.
+                fresh = growing.is_placed() && share < LAST_LOOK;
                 // As soon as anything can be seen, however much waits.
                 if fresh && looked.is_none() {
                     looked = look(&mut growing);
@@ -114,6 +119,8 @@ pub(super) struct Feeding<'a> {
     meanwhile: Option<Meanwhile>,
     /// Of every view, what has not been handed over.
     waiting: Vec<PointCloud>,
+    /// Share of the scan that is done.
+    share: f64,
 }
 
 impl<'a> Feeding<'a> {
@@ -145,6 +152,7 @@ impl<'a> Feeding<'a> {
             inner,
             meanwhile,
             waiting: vec![empty; profilers.len()],
+            share: 0.0,
         }
     }
 
@@ -168,12 +176,15 @@ impl<'a> Feeding<'a> {
             views: waiting.views.clone(),
         };
         // Where its thread has ended the count of points tells.
-        let _ = meanwhile.sender.send(Message::Piece(piece));
+        let _ = meanwhile.sender.send(Message::Piece(piece, self.share));
     }
 }
 
 impl ScanWatch for Feeding<'_> {
     fn event(&mut self, event: ScanEvent) {
+        if let ScanEvent::Progress { share, .. } = &event {
+            self.share = *share;
+        }
         self.inner.event(event);
     }
 

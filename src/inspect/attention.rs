@@ -75,6 +75,11 @@ impl Outline {
         self.near_mm
     }
 
+    /// The cells in which `positions` lie.
+    pub(super) fn cells_of(&self, positions: &[DVec3]) -> CellSet {
+        positions.iter().map(|p| self.grid.cell(*p)).collect()
+    }
+
     /// Whether `p` lies near a nominal edge; `hit` is scratch.
     pub(super) fn is_near(&self, p: DVec3, hit: &mut Vec<(u32, f64)>) -> bool {
         if !self.cells.contains(&self.grid.cell(p)) {
@@ -144,37 +149,48 @@ fn runs(positions: &[DVec3], places: &[Place], outline: &Outline) -> Vec<((u32, 
     runs
 }
 
-/// The points on which the detector is to look, and those of them whose edges count.
-pub(super) struct Attended {
-    /// Indices of points, ascending.
-    pub(super) seen: Vec<usize>,
-    /// Of every one of `seen`, whether an edge there counts.
-    pub(super) counts: Vec<bool>,
+/// Where the detector is to look.
+pub(super) struct Attention<'a> {
+    outline: &'a Outline,
+    /// Where an edge counts.
+    look: CellSet,
+    /// And what has to be seen around that.
+    see: CellSet,
 }
 
-/// The points of `positions` around `cells` and around `places`.
-pub(super) fn attended(
-    positions: &[DVec3],
-    outline: &Outline,
-    cells: &CellSet,
-    places: &[DVec3],
-) -> Attended {
-    let grown = |reach: i32| -> CellSet {
-        let places = places.iter().map(|p| outline.grid.cell(*p));
-        let all = cells.iter().copied().chain(places);
-        all.flat_map(|cell| around(cell, reach)).collect()
-    };
-    let (look, see) = (grown(LOOK), grown(LOOK + SEE));
-    let found: Vec<(usize, bool)> = positions
-        .par_iter()
-        .enumerate()
-        .filter_map(|(i, p)| {
-            let cell = outline.grid.cell(*p);
-            see.contains(&cell).then(|| (i, look.contains(&cell)))
-        })
-        .collect();
-    let (seen, counts) = found.into_iter().unzip();
-    Attended { seen, counts }
+impl<'a> Attention<'a> {
+    /// To what lies around `cells` and around `places`.
+    pub(super) fn new(outline: &'a Outline, cells: &CellSet, places: &[DVec3]) -> Self {
+        let grown = |reach: i32| -> CellSet {
+            let places = places.iter().map(|p| outline.grid.cell(*p));
+            let all = cells.iter().copied().chain(places);
+            all.flat_map(|cell| around(cell, reach)).collect()
+        };
+        Self {
+            outline,
+            look: grown(LOOK),
+            see: grown(LOOK + SEE),
+        }
+    }
+
+    /// Whether points in `cells` are to be seen.
+    pub(super) fn touches(&self, cells: &CellSet) -> bool {
+        !self.see.is_disjoint(cells)
+    }
+
+    /// Indices of the points that are to be seen, ascending, and of each whether an edge there counts.
+    pub(super) fn of(&self, positions: &[DVec3]) -> (Vec<usize>, Vec<bool>) {
+        let found: Vec<(usize, bool)> = positions
+            .par_iter()
+            .enumerate()
+            .filter_map(|(i, p)| {
+                let cell = self.outline.grid.cell(*p);
+                let seen = self.see.contains(&cell);
+                seen.then(|| (i, self.look.contains(&cell)))
+            })
+            .collect();
+        found.into_iter().unzip()
+    }
 }
 
 fn around(cell: Cell, reach: i32) -> impl Iterator<Item = Cell> {

@@ -8,7 +8,7 @@ use std::f64::consts::PI;
 
 use glam::DVec3;
 
-use super::attention::{CellSet, Outline, Patches, attended};
+use super::attention::{Attention, CellSet, Outline, Patches};
 use super::body::BodyEdge;
 use super::measure::{MeasuredEdge, MeasuredStation, PARALLEL};
 use crate::features::{self, Class, Method};
@@ -34,8 +34,8 @@ pub struct Compared {
 
 /// Points in the part frame with what their patches say of them.
 pub(super) struct Scanned<'a> {
-    /// One or more parts of the scan.
-    pub(super) clouds: &'a [&'a PointCloud],
+    /// One or more parts of the scan, with the cells in which they lie where these are known.
+    pub(super) clouds: &'a [(&'a PointCloud, Option<&'a CellSet>)],
     pub(super) patches: &'a Patches,
     pub(super) outline: &'a Outline,
     pub(super) spacing: Spacing,
@@ -47,17 +47,33 @@ pub(super) fn near_mm(spacing: &Spacing) -> f64 {
     NEAR * spacing.across_mm
 }
 
-/// Compares the edges of a scan with those of the nominal. The detector looks only where the deviation from the nominal, or a station
-/// without an edge of its own, gives it reason to.
-pub(super) fn compare(scanned: &Scanned<'_>, edges: (&[BodyEdge], &[MeasuredEdge])) -> Compared {
+/// What the detector finds where the deviation from the nominal gives it reason to look.
+pub(super) fn look(scanned: &Scanned<'_>) -> Vec<DVec3> {
+    if scanned.outline.near_mm() <= 0.0 {
+        return Vec::new();
+    }
+    let cells = scanned
+        .patches
+        .suspicious(scanned.outline, scanned.noise_mm);
+    edges_found(scanned, &cells, &[])
+}
+
+/// Compares the edges of a scan, of which [`look`] has `found` some, with those of the nominal. The detector looks again where a station
+/// shows no edge of its own.
+pub(super) fn compare(
+    scanned: &Scanned<'_>,
+    mut found: Vec<DVec3>,
+    edges: (&[BodyEdge], &[MeasuredEdge]),
+) -> Compared {
     let outline = scanned.outline;
     if outline.near_mm() <= 0.0 {
         return Compared::default();
     }
     let doubtful = doubtful(edges.1);
     let all: Vec<DVec3> = doubtful.iter().flatten().copied().collect();
-    let cells = scanned.patches.suspicious(outline, scanned.noise_mm);
-    let found = edges_found(scanned, &cells, &all);
+    if !all.is_empty() {
+        found.extend(edges_found(scanned, &CellSet::default(), &all));
+    }
     Compared {
         unexpected: unexpected(&found, outline),
         missing: missing(&found, edges, &doubtful, outline.near_mm()),
@@ -67,10 +83,13 @@ pub(super) fn compare(scanned: &Scanned<'_>, edges: (&[BodyEdge], &[MeasuredEdge
 /// The points of the scan around `cells` and `places` that lie on an edge.
 fn edges_found(scanned: &Scanned<'_>, cells: &CellSet, places: &[DVec3]) -> Vec<DVec3> {
     let mut counts = Vec::new();
-    let parts = scanned.clouds.iter().map(|cloud| {
-        let attended = attended(&cloud.positions, scanned.outline, cells, places);
-        counts.extend(attended.counts);
-        cloud.subset(&attended.seen)
+    let attention = Attention::new(scanned.outline, cells, places);
+    let clouds = scanned.clouds.iter();
+    let touched = clouds.filter(|(_, cells)| cells.is_none_or(|cells| attention.touches(cells)));
+    let parts = touched.map(|(cloud, _)| {
+        let (seen, count) = attention.of(&cloud.positions);
+        counts.extend(count);
+        cloud.subset(&seen)
     });
     // All parts name the same views.
     let together = parts.reduce(|mut all, part| {

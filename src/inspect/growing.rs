@@ -14,7 +14,7 @@ use serde::Serialize;
 
 use super::align::{Aligned, Candidates, Conclusion, LaidPoint, Scan, align_again, align_keeping};
 use super::assign::{Place, Surface, towards};
-use super::attention::{Outline, Patches};
+use super::attention::{CellSet, Outline, Patches};
 use super::body::Body;
 use super::collect::Layer;
 use super::compare::{self, Scanned};
@@ -38,8 +38,8 @@ const SKETCH_ENOUGH: usize = 1500;
 /// The pose is found anew when this many times as many points are there: half of the scan is then laid twice.
 const AGAIN: f64 = 2.2;
 
-/// Points that solve for the last pose at most: it is then known to a hundredth of what a station is.
-const POSE_POINTS: usize = 400_000;
+/// Points that solve for the last pose at most: what that leaves open adds less than a hundredth to the variance of a station.
+const POSE_POINTS: usize = 200_000;
 
 /// Relative changes of spacing and noise, as estimated by a part of the scan and by all of it, that change no station.
 const SAME_SPACING: f64 = 0.03;
@@ -63,7 +63,6 @@ pub struct Growing<'a, B: Body> {
     sketch: PointCloud,
     cells: HashSet<IVec3, FixedState>,
     base: Option<Base<'a, B>>,
-    breaks: Vec<super::measuring::Breaks>,
 }
 
 /// Points of consecutive profiles.
@@ -73,6 +72,8 @@ struct Piece {
     part: PointCloud,
     places: Vec<Place>,
     rims: Vec<f32>,
+    /// Where its points lie.
+    cells: CellSet,
 }
 
 impl Piece {
@@ -130,7 +131,6 @@ impl<'a, B: Body> Growing<'a, B> {
             sketch: PointCloud::from_positions(Frame::Machine, Vec::new()),
             cells: HashSet::default(),
             base: None,
-            breaks: Vec::new(),
         }
     }
 
@@ -163,6 +163,7 @@ impl<'a, B: Body> Growing<'a, B> {
             part: PointCloud::from_positions(Frame::Part, Vec::new()),
             places: Vec::new(),
             rims: Vec::new(),
+            cells: CellSet::default(),
         });
         let last = self.pieces.len() - 1;
         let due = |base: &Base<'_, B>| self.points as f64 > AGAIN * base.points as f64;
@@ -175,11 +176,11 @@ impl<'a, B: Body> Growing<'a, B> {
 
     /// Measures what has been laid; the edges as they are now.
     pub fn measure(&mut self) -> Vec<EdgeSoFar> {
-        let Some(edges) = self.measured(None) else {
+        let Some(base) = &mut self.base else {
             return Vec::new();
         };
-        let machine = self.base.as_ref().map(|base| base.pose.inverse());
-        let machine = machine.unwrap_or(RigidTransform::IDENTITY);
+        let edges = measured(&mut base.measuring, &self.pieces, None);
+        let machine = base.pose.inverse();
         let named = edges.iter().zip(self.nominal.edges()).zip(&self.resolved);
         named
             .map(|((edge, nominal), asked)| {
@@ -216,7 +217,7 @@ impl<'a, B: Body> Growing<'a, B> {
         stages.begin("edges");
         let mut findings = std::mem::take(&mut self.findings);
         findings.extend(of_alignment);
-        let Some(base) = &self.base else {
+        let Some(base) = &mut self.base else {
             return self.all_at_once();
         };
         let estimate = ScanEstimate {
@@ -227,12 +228,10 @@ impl<'a, B: Body> Growing<'a, B> {
             pose_covariance: alignment.covariance,
             ..measure_settings(&base.spacing, base.noise_mm, &self.request, &mut findings)
         };
-        let measured = self.measured(Some((&motion, &settings)));
-        stages.begin("comparison of edges found");
-        let (Some(measured), Some(base)) = (measured, &self.base) else {
-            return self.all_at_once();
-        };
-        let clouds: Vec<&PointCloud> = self.pieces.iter().map(|piece| &piece.part).collect();
+        let pieces = self.pieces.iter();
+        let clouds: Vec<(&PointCloud, Option<&CellSet>)> = pieces
+            .map(|piece| (&piece.part, Some(&piece.cells)))
+            .collect();
         let scanned = Scanned {
             clouds: &clouds,
             patches: &base.patches,
@@ -240,8 +239,20 @@ impl<'a, B: Body> Growing<'a, B> {
             spacing: base.spacing,
             noise_mm: base.noise_mm,
         };
+        // Neither keeps both cores busy all the time.
+        let (measured, found) = rayon::join(
+            || {
+                measured(
+                    &mut base.measuring,
+                    &self.pieces,
+                    Some((&motion, &settings)),
+                )
+            },
+            || compare::look(&scanned),
+        );
+        stages.begin("comparison of edges found");
         let edges = base.measuring.edges();
-        let compared = compare::compare(&scanned, (edges, &measured));
+        let compared = compare::compare(&scanned, found, (edges, &measured));
         let taken = Taken {
             alignment,
             findings,
@@ -374,6 +385,7 @@ impl<'a, B: Body> Growing<'a, B> {
             })
             .collect();
         (piece.places, piece.rims) = laid.into_iter().unzip();
+        piece.cells = base.outline.cells_of(&piece.part.positions);
         base.patches
             .add(&piece.part.positions, &piece.places, &base.outline);
         base.measuring.add(&piece.layer());
@@ -441,24 +453,21 @@ impl<'a, B: Body> Growing<'a, B> {
         self.set_base(pose, known, Vec::new());
         RigidTransform::IDENTITY
     }
+}
 
-    /// All edges, as the flanks and shapes are now; after a motion, with the settings that hold at the end.
-    fn measured(
-        &mut self,
-        end: Option<(&RigidTransform, &MeasureSettings)>,
-    ) -> Option<Vec<MeasuredEdge>> {
-        let base = self.base.as_mut()?;
-        let layers: Vec<Layer<'_>> = self.pieces.iter().map(Piece::layer).collect();
-        base.measuring.measure(&layers);
-        self.breaks = base.measuring.breaks(&layers);
-        let own = *base.measuring.settings();
-        let (motion, settings) = end.unwrap_or((&RigidTransform::IDENTITY, &own));
-        let centre = motion.point(centre(&layers));
-        Some(
-            base.measuring
-                .combined(&self.breaks, motion, settings, centre),
-        )
-    }
+/// All edges, as the flanks and shapes are now; after a motion, with the settings that hold at the end.
+fn measured<B: Body>(
+    measuring: &mut Measuring<'_, B>,
+    pieces: &[Piece],
+    end: Option<(&RigidTransform, &MeasureSettings)>,
+) -> Vec<MeasuredEdge> {
+    let layers: Vec<Layer<'_>> = pieces.iter().map(Piece::layer).collect();
+    measuring.measure(&layers);
+    let breaks = measuring.breaks(&layers);
+    let own = *measuring.settings();
+    let (motion, settings) = end.unwrap_or((&RigidTransform::IDENTITY, &own));
+    let centre = motion.point(centre(&layers));
+    measuring.combined(&breaks, motion, settings, centre)
 }
 
 fn so_far(id: String, edge: &MeasuredEdge, machine: &RigidTransform) -> EdgeSoFar {
