@@ -1,7 +1,7 @@
 //! `cargo bench --bench disasters`: what the daemon does when its surroundings fail: a full disk, a read-only disk, a locked database,
 //! floods of nonsense, slow clients, a huge body, a clock that goes back. One line each: what was done, what was seen.
 //!
-//! The daemon is the program itself with the demo's simulated devices, on a small disk in memory. Needs Linux and root for that disk, and
+//! The daemon is the program itself with the demo's simulated devices, on a small disk in a file. Needs Linux and root for that disk, and
 //! libfaketime for the clock; what is not there is said and left out.
 
 #![allow(clippy::print_stdout)] // what a bench is for
@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 const PORT: u16 = 18_371;
-const DISK_MB: u32 = 96;
+const DISK_MB: u64 = 120;
 /// Longer than anything here may take.
 const LONG: Duration = Duration::from_secs(60);
 const CLOCK: &str = "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1";
@@ -22,34 +22,42 @@ const CLOCK: &str = "/usr/lib/x86_64-linux-gnu/faketime/libfaketimeMT.so.1";
 fn main() {
     let folder = std::env::temp_dir().join(format!("acies-disasters-{}", std::process::id()));
     std::fs::create_dir_all(&folder).expect("a folder");
-    let size = format!("size={DISK_MB}m");
-    let disk = run(
-        "mount",
-        &["-t", "tmpfs", "-o", &size, "acies", &text(&folder)],
-    );
+    let image = folder.with_extension("img");
+    let disk = mounted(&image, &folder);
     let cell = folder.join("cell");
-    let clock = folder.join("clock");
-    std::fs::write(&clock, "+0").expect("the clock's file");
-    let daemon = Daemon::start(&cell, &clock);
+    let daemon = Daemon::start(&cell, None);
     until("ready", &|| state().contains("\"accepts\":true"));
     println!("start: {}", measured("before"));
     if disk {
         disk_full(&cell);
-        read_only(&folder);
-    } else {
-        println!("disk full, read-only disk: left out, no disk in memory can be mounted (root?)");
     }
     locked(&cell);
-    clock_back(&clock);
     nonsense();
     slow_clients();
     huge_body();
-    println!("end: {}; {}", measured("after"), daemon.process());
+    println!("afterwards: {}; {}", measured("after"), daemon.process());
     drop(daemon);
-    if disk {
-        run("umount", &[&text(&folder)]);
+    if Path::new(CLOCK).exists() {
+        clock_back(&cell, &folder.join("clock"));
+    } else {
+        println!("clock back a day: left out, no libfaketime");
     }
+    if disk {
+        read_only(&cell, &folder);
+        run("umount", &["-l", &text(&folder)]);
+    } else {
+        println!("disk full, read-only disk: left out, no image of a disk can be mounted (root?)");
+    }
+    let _ = std::fs::remove_file(&image);
     let _ = std::fs::remove_dir_all(&folder);
+}
+
+/// A small disk in a file.
+fn mounted(image: &Path, folder: &Path) -> bool {
+    let made = std::fs::File::create(image).and_then(|file| file.set_len(DISK_MB << 20));
+    made.is_ok()
+        && run("mkfs.ext4", &["-q", &text(image)])
+        && run("mount", &["-o", "loop", &text(image), &text(folder)])
 }
 
 fn disk_full(cell: &Path) {
@@ -68,16 +76,17 @@ fn disk_full(cell: &Path) {
     );
 }
 
-fn read_only(folder: &Path) {
-    run("mount", &["-o", "remount,ro", &text(folder)]);
+/// What the kernel does with a disk that fails. It stays so: this comes last.
+fn read_only(cell: &Path, folder: &Path) {
+    let daemon = Daemon::start(cell, None);
+    until("ready", &|| state().contains("\"accepts\":true"));
+    run("mount", &["-o", "remount,abort", &text(folder)]);
     let during = measured("read-only");
     let said = field(&state(), "cause");
-    run("mount", &["-o", "remount,rw", &text(folder)]);
-    let (status, _) = ask("POST", "/api/v1/reset", "");
-    until("ready", &|| state().contains("\"accepts\":true"));
     println!(
-        "read-only disk: {during}; cause {said:?}; reset after remounting: {status}; then {}",
-        measured("writable again")
+        "read-only disk: {during}; cause {said:?}; status answered {}; {}",
+        ask("GET", "/api/v1/status", "").0,
+        daemon.process()
     );
 }
 
@@ -113,21 +122,22 @@ fn locked(cell: &Path) {
     );
 }
 
-fn clock_back(clock: &Path) {
-    if !Path::new(CLOCK).exists() {
-        println!("clock back a day: left out, no libfaketime");
-        return;
-    }
+fn clock_back(cell: &Path, clock: &Path) {
+    std::fs::write(clock, "+0").expect("the clock");
+    let daemon = Daemon::start(cell, Some(clock));
+    until("ready", &|| state().contains("\"accepts\":true"));
+    let today = measured("today");
     std::fs::write(clock, "-1d").expect("the clock");
-    let first = measured("a day earlier");
+    let earlier = measured("a day earlier");
     let (_, newest) = ask("GET", "/api/v1/inspections?limit=2", "");
-    let order = newest.find("a day earlier").zip(newest.find("free again"));
+    let order = newest.find("a day earlier").zip(newest.find("today"));
     std::fs::write(clock, "+0").expect("the clock");
     println!(
-        "clock back a day: {first}; newest first in the history: {}; then {}",
+        "clock back a day: {today}, {earlier}; newest first in the history: {}; then {}",
         order.is_some_and(|(a, b)| a < b),
         measured("the right day")
     );
+    drop(daemon);
 }
 
 /// As many requests as go through in five seconds, of bytes that are no HTTP, unknown paths, wrong bodies.
@@ -337,7 +347,7 @@ fn field(json: &str, name: &str) -> String {
 struct Daemon(Child);
 
 impl Daemon {
-    fn start(cell: &Path, clock: &Path) -> Self {
+    fn start(cell: &Path, clock: Option<&Path>) -> Self {
         let mut command = Command::new(env!("CARGO_BIN_EXE_acies"));
         command.args([
             "demo",
@@ -346,13 +356,11 @@ impl Daemon {
             "--serve",
             &format!("127.0.0.1:{PORT}"),
         ]);
-        if Path::new(CLOCK).exists() {
-            command
-                .env("LD_PRELOAD", CLOCK)
-                .env("FAKETIME_TIMESTAMP_FILE", clock);
-            command
-                .env("FAKETIME_NO_CACHE", "1")
-                .env("DONT_FAKE_MONOTONIC", "1");
+        if let Some(clock) = clock {
+            command.env("LD_PRELOAD", CLOCK);
+            command.env("FAKETIME_TIMESTAMP_FILE", clock);
+            command.env("FAKETIME_NO_CACHE", "1");
+            command.env("DONT_FAKE_MONOTONIC", "1");
         }
         let child = command.stdout(Stdio::null()).stderr(Stdio::null()).spawn();
         Self(child.expect("the daemon"))

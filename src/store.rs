@@ -50,9 +50,7 @@ pub enum StoreError {
         source: std::io::Error,
     },
     /// The database.
-    #[error(
-        "{path}: {source}; a full disk, a read-only disk and a file on a network drive are the usual causes"
-    )]
+    #[error("{path}: {source}; {}", causes(source))]
     Database {
         /// The database.
         path: PathBuf,
@@ -324,6 +322,21 @@ fn audit(connection: &Connection, entry: &Audit<'_>, at: SystemTime) -> rusqlite
             entry.why,
         ))?;
     Ok(())
+}
+
+/// What usually lies behind an error of the database, and what to do.
+fn causes(error: &rusqlite::Error) -> &'static str {
+    use rusqlite::ErrorCode::{DatabaseBusy, DatabaseLocked, DiskFull, ReadOnly};
+    match error.sqlite_error_code() {
+        Some(DatabaseBusy | DatabaseLocked) => {
+            "another program holds it: close that program, use `acies export` and `acies backup` instead"
+        }
+        Some(DiskFull) => "make room on its disk",
+        Some(ReadOnly) => {
+            "its disk is read-only: look at the system's log, mount it writable again"
+        }
+        _ => "a full disk, a read-only disk and a file on a network drive are the usual causes",
+    }
 }
 
 /// A thread that panicked inside a call left a transaction that SQLite rolled back: what is behind the lock is whole.
