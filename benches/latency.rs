@@ -1,18 +1,21 @@
 //! `cargo bench --bench latency [-- ROUNDS]`: the demo's part scanned in real time, 2,000,000 points in about 10 s; time from the last
-//! profile to the committed verdict, and what the daemon takes of the processor meanwhile. `-- stages` gives one run's seconds by stage.
+//! profile to the committed verdict, and what the daemon takes of the processor meanwhile. `-- stages` gives one run's seconds by stage,
+//! `-- page` serves the page besides and opens it in two browsers (Chromium, headless) on the same machine.
 //!
-//! Simulated devices run in the same process on the same cores; their share is in the processor time shown.
+//! Simulated devices run in the same process on the same cores; their share is in the processor time shown, that of browsers is not.
 
 #![allow(clippy::print_stdout)] // what a bench is for
 
-use std::net::SocketAddr;
+use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use acies::cell::{self, Daemon, DaemonOptions, Mode, Snapshot, State};
-use acies::config::Cell;
+use acies::cell::{self, Daemon, DaemonOptions, Handle, Mode, Snapshot, State};
+use acies::config::{Cell, Service};
 use acies::store::{Order, Store};
+use acies::web;
 use acies_drivers::link::cable::Cable;
 use acies_simulators::demo_cell::{DemoCell, DemoOptions};
 use acies_simulators::grbl::SimulatedProbe;
@@ -38,7 +41,8 @@ fn main() {
     if stages {
         by_stage(&cell);
     } else {
-        in_the_daemon(cell, &folder, rounds);
+        let page = arguments.iter().any(|a| a == "page");
+        in_the_daemon(cell, &folder, rounds, page);
     }
     drop(playing);
     let _ = std::fs::remove_dir_all(&folder);
@@ -90,7 +94,55 @@ fn by_stage(cell: &Cell) {
     }
 }
 
-fn in_the_daemon(cell: Cell, folder: &Path, rounds: usize) {
+/// Browsers that have the page open.
+struct Browsers(Vec<Child>);
+
+impl Drop for Browsers {
+    fn drop(&mut self) {
+        for browser in &mut self.0 {
+            let _ = browser.kill();
+            let _ = browser.wait();
+        }
+    }
+}
+
+/// Serves the page until this program ends, and opens it twice.
+fn opened(handle: Handle, service: Service, folder: &Path) -> Browsers {
+    let listener = TcpListener::bind(("127.0.0.1", 0)).expect("a port");
+    let address = listener.local_addr().expect("it is bound");
+    listener
+        .set_nonblocking(true)
+        .expect("sockets can be set so");
+    std::thread::spawn(move || {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(2)
+            .enable_all()
+            .build()
+            .expect("a runtime");
+        runtime.block_on(async move {
+            let listener = tokio::net::TcpListener::from_std(listener)?;
+            web::serve_cell(listener, handle, service, std::future::pending()).await
+        })
+    });
+    let browser = |number: usize| {
+        Command::new("chromium")
+            .args(["--headless=new", "--no-sandbox", "--disable-gpu"])
+            .args(["--remote-debugging-port=0", "--window-size=1280,900"])
+            .arg(format!(
+                "--user-data-dir={}",
+                folder.join(format!("browser{number}")).display()
+            ))
+            .arg(format!("http://{address}/"))
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .expect("chromium")
+    };
+    Browsers((0..2).map(browser).collect())
+}
+
+fn in_the_daemon(cell: Cell, folder: &Path, rounds: usize, page: bool) {
+    let service = cell.service.clone();
     let store = Arc::new(Store::open(&folder.join("store")).expect("the store"));
     let options = DaemonOptions {
         simulated: true,
@@ -98,6 +150,7 @@ fn in_the_daemon(cell: Cell, folder: &Path, rounds: usize) {
     };
     let daemon = Daemon::start(Arc::new(cell), store, Arc::new(Cable), options).expect("a daemon");
     let handle = daemon.handle();
+    let _browsers = page.then(|| opened(daemon.handle(), service, folder));
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()
