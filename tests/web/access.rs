@@ -25,6 +25,7 @@ const OPERATOR: [&str; 28] = [
     "GET /api/v1/events",
     "GET /api/v1/live/points",
     "GET /api/v1/live/profiles",
+    "GET /api/v1/live/edges",
     "GET /api/v1/devices",
     "GET /api/v1/storage",
     "GET /api/v1/inspections",
