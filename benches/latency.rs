@@ -208,6 +208,12 @@ fn in_the_daemon(cell: Cell, folder: &Path, rounds: usize, page: bool) {
         "    the last one by stage, s: {}",
         report.map_or("?".to_owned(), |r| r["seconds"].to_string())
     );
+    let status = std::fs::read_to_string("/proc/self/status").unwrap_or_default();
+    let most = status.lines().find(|line| line.starts_with("VmHWM"));
+    println!(
+        "    memory at most, simulators included: {}",
+        most.unwrap_or("?")
+    );
     seconds.sort_by(f64::total_cmp);
     println!(
         "{rounds} rounds: verdict {:.3} s after the last profile (median), {:.3} s (worst)",

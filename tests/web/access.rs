@@ -19,7 +19,7 @@ const EVERYBODY: [&str; 9] = [
     "POST /api/v1/logout",
     "GET /page/nothing.js",
 ];
-const OPERATOR: [&str; 28] = [
+const OPERATOR: [&str; 29] = [
     "GET /metrics",
     "GET /api/v1/status",
     "GET /api/v1/events",
