@@ -47,6 +47,7 @@ const ROUTES: &[(&str, &str, Need)] = &[
     ("GET", "/api/v1/events", AtLeast(Operator)),
     ("GET", "/api/v1/live/points", AtLeast(Operator)),
     ("GET", "/api/v1/live/profiles", AtLeast(Operator)),
+    ("GET", "/api/v1/live/edges", AtLeast(Operator)),
     ("GET", "/api/v1/devices", AtLeast(Operator)),
     ("GET", "/api/v1/storage", AtLeast(Operator)),
     ("GET", "/api/v1/inspections", AtLeast(Operator)),
