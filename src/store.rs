@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use rusqlite::{Connection, OpenFlags};
+use rusqlite::{Connection, OpenFlags, TransactionBehavior};
 use serde::{Deserialize, Serialize};
 use utoipa::ToSchema;
 
@@ -157,6 +157,8 @@ impl Store {
         };
         let mut writer = Connection::open(&path).map_err(at)?;
         writer.busy_timeout(BUSY).map_err(at)?;
+        // A transaction that begins by reading does not wait for another program when it comes to write.
+        writer.set_transaction_behavior(TransactionBehavior::Immediate);
         // FULL: a commit is on the disk before it returns, also in the write-ahead log.
         writer
             .execute_batch(
