@@ -27,7 +27,9 @@ export function livePictures() {
   const look = async () => {
     try {
       const [profiles, stations] = await Promise.all([get("/live/profiles"), edges.fetch(), points.fetch()]);
-      points.stations = stations;
+      // What is measured in the end stands in the result.
+      edges.element.hidden = !running || stations.length === 0;
+      points.stations = running ? stations : [];
       drawProfiles(profile, profiles);
       points.draw();
       amount.textContent = t("live.amount", { count: points.shown.toLocaleString(document.documentElement.lang) });
@@ -74,7 +76,6 @@ function edgesSoFar() {
       const seen = now.edges.filter((edge) => edge.coverage > 0);
       seen.sort((a, b) => Math.abs(b.worst_d_mm) - Math.abs(a.worst_d_mm));
       rows.replaceChildren(...seen.map(row));
-      element.hidden = seen.length === 0;
       stations = seen.flatMap((edge) => edge.stations);
       return stations;
     },
