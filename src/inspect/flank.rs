@@ -96,8 +96,10 @@ pub enum FlankModel {
     /// Offset, tilt across and slope along the edge: of a plane face a plane, of any other the nominal face displaced.
     #[default]
     Displaced,
-    /// A bend across the edge as well: of a plane face a quadric.
+    /// A bend across the edge as well.
     Bent,
+    /// Bend, twist and bow, all of the second order: of a plane face a quadric.
+    Quadric,
 }
 
 /// The linear map from the points of one fit to (offset, tilt), for redrawing them: see [`super::monte_carlo`].
@@ -120,8 +122,8 @@ pub struct FlankFit {
     pub tilt: f64,
     /// Change of the deviation per mm along the edge.
     pub slope: f64,
-    /// Coefficient of the square of the distance into the face, 1/mm; 0 where the flank is not bent.
-    pub bend: f64,
+    /// Coefficients of r squared (bend), r s (twist) and s squared (bow), 1/mm; 0 where the model has none.
+    pub second: [f64; 3],
     /// Covariance of (offset, tilt), all that the data show: noise, correlated noise, lack of fit.
     pub covariance: [[f64; 2]; 2],
     /// Standard deviation of one point, mm.
@@ -137,7 +139,8 @@ pub struct FlankFit {
 impl FlankFit {
     /// Deviation from the nominal face at distance `r` into the face and `s` along the edge from the station, mm.
     pub fn deviation_mm(&self, r: f64, s: f64) -> f64 {
-        self.offset_mm + (self.tilt + self.bend * r) * r + self.slope * s
+        let [bend, twist, bow] = self.second;
+        self.offset_mm + (self.tilt + bend * r + twist * s) * r + (self.slope + bow * s) * s
     }
 }
 
@@ -182,8 +185,8 @@ pub struct FlankSeries {
 /// Measures one flank at every station of its edge.
 ///
 /// The transition zone (edge break, spot smear, mixed points) is found from the data by [`transition::find_cuts`]; where
-/// it takes more than half of the reach, the reach is doubled up to its limit. A term in r squared joins the model where
-/// the stations of the edge together demand it.
+/// it takes more than half of the reach, the reach is doubled up to its limit. Terms of the second order join the model where
+/// the stations of the edge together demand them.
 pub fn measure_flank(
     points: &FlankPoints,
     windows: &Windows,
@@ -203,13 +206,43 @@ pub fn measure_flank_again(
     let bent = fit_series::<4>(points, windows, &settled, memo);
     if bend_is_significant(&bent) {
         let richer = fit_series::<5>(points, windows, &settled, memo);
-        return finish(bent, &richer, &settled, FlankModel::Bent);
+        return quadric(
+            points,
+            windows,
+            (&settled, &variance::estimate(&bent)),
+            memo,
+        )
+        .unwrap_or_else(|| finish(bent, &richer, &settled, FlankModel::Bent));
     }
     // A straight flank is extrapolated with less noise, so its transition zone is seen more sharply.
     let settled = settle_cuts::<3>(points, windows, settings, memo);
     let straight = fit_series::<3>(points, windows, &settled, memo);
     let richer = fit_series::<4>(points, windows, &settled, memo);
-    finish(straight, &richer, &settled, FlankModel::Displaced)
+    quadric(
+        points,
+        windows,
+        (&settled, &variance::estimate(&straight)),
+        memo,
+    )
+    .unwrap_or_else(|| finish(straight, &richer, &settled, FlankModel::Displaced))
+}
+
+/// The flank with all terms of the second order, where a poorer model with this `noise` leaves something and twist or bow explain it.
+fn quadric(
+    points: &FlankPoints,
+    windows: &Windows,
+    (settled, noise): (&Settled, &[variance::Noise]),
+    memo: &mut Memo,
+) -> Option<FlankSeries> {
+    if !noise.iter().any(|n| n.lack_of_fit) {
+        return None;
+    }
+    let second = fit_series::<6>(points, windows, settled, memo);
+    if !twist_or_bow_is_significant(&second) {
+        return None;
+    }
+    let richer = fit_series::<7>(points, windows, settled, memo);
+    Some(finish(second, &richer, settled, FlankModel::Quadric))
 }
 
 /// The range that every station uses.
@@ -242,7 +275,7 @@ fn settle_cuts<const P: usize>(
     }
 }
 
-/// The fit of one window in P unknowns (offset, tilt, slope, bend, cubic), with what its variance is estimated from.
+/// The fit of one window in the P unknowns of [`row`], with what its variance is estimated from.
 #[derive(Debug, Clone)]
 struct WindowFit<const P: usize> {
     fit: LinearFit<P>,
@@ -256,8 +289,12 @@ struct WindowFit<const P: usize> {
 
 type Series<const P: usize> = Vec<Result<WindowFit<P>, FlankGap>>;
 
+/// Offset, tilt, slope, bend; then of five unknowns the cubic across, of six twist and bow, of seven all three.
 fn row<const P: usize>(r: f64, s: f64) -> [f64; P] {
-    let terms = [1.0, r, s, r * r, r * r * r];
+    let terms = match P {
+        5 => [1.0, r, s, r * r, r * r * r, 0.0, 0.0],
+        _ => [1.0, r, s, r * r, r * s, s * s, r * r * r],
+    };
     std::array::from_fn(|k| terms[k])
 }
 
@@ -394,6 +431,25 @@ fn bend_is_significant(series: &Series<4>) -> bool {
     count > 0.0 && chi > count + 4.0 * (2.0f64 * count).sqrt()
 }
 
+/// Whether the stations together show twist or bow, as [`bend_is_significant`] asks for the bend. Noise that a scan line shares looks like bow,
+/// so that it counts here.
+fn twist_or_bow_is_significant(series: &Series<6>) -> bool {
+    let noise = variance::estimate(series);
+    [4, 5].into_iter().any(|term| {
+        let (mut chi, mut count) = (0.0, 0.0);
+        for (window, noise) in series.iter().zip(&noise) {
+            let Ok(window) = window else { continue };
+            let variance = noise.full(window)[term][term];
+            if variance > 0.0 {
+                chi += (window.fit.coefficients[term].powi(2) / variance).min(25.0);
+                count += 1.0;
+            }
+        }
+        // What lines share is known from about as many freedoms as there are stations: a quotient of two such has twice the variance.
+        count > 0.0 && chi > count + 4.0 * (4.0f64 * count).sqrt()
+    })
+}
+
 /// Gives every station its covariance; `richer` is the same flank in a model of one unknown more.
 fn finish<const P: usize, const Q: usize>(
     series: Series<P>,
@@ -424,13 +480,15 @@ fn finish<const P: usize, const Q: usize>(
                 return Err(FlankGap::Turned(turn_rad));
             }
             let covariance = noise.covariance(&window).map(|row| row.map(|v| v * form));
+            let term = |k: usize| window.fit.coefficients.get(k).copied().unwrap_or(0.0);
             Ok(FlankFit {
                 offset_mm: window.fit.coefficients[0],
                 tilt: window.fit.coefficients[1],
                 slope: window.fit.coefficients[2],
-                bend: match model {
-                    FlankModel::Displaced => 0.0,
-                    FlankModel::Bent => window.fit.coefficients[3],
+                second: match model {
+                    FlankModel::Displaced => [0.0; 3],
+                    FlankModel::Bent => [term(3), 0.0, 0.0],
+                    FlankModel::Quadric => [term(3), term(4), term(5)],
                 },
                 covariance,
                 sigma_mm: window.sigma,

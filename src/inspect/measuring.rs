@@ -455,7 +455,9 @@ fn name_of(stretch: &Stretch<'_>, near: &[Near]) -> u64 {
                 fit.offset_mm,
                 fit.tilt,
                 fit.slope,
-                fit.bend,
+                fit.second[0],
+                fit.second[1],
+                fit.second[2],
                 fit.cut_mm,
                 fit.sigma_mm,
             ];

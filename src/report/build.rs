@@ -530,6 +530,7 @@ fn fill_measured(station: &mut wire::Station, measured: &Measured) {
     station.flank_models = Some(measured.flank_model.map(|model| match model {
         FlankModel::Displaced => wire::FlankModel::Displaced,
         FlankModel::Bent => wire::FlankModel::Bent,
+        FlankModel::Quadric => wire::FlankModel::Quadric,
     }));
     station.ridge = measured.ridge.and_then(|ridge| {
         Some(wire::EdgePoint {

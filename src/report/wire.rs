@@ -447,6 +447,8 @@ pub enum FlankModel {
     Displaced,
     /// A bend across the edge as well.
     Bent,
+    /// Bend, twist and bow, all of the second order.
+    Quadric,
 }
 
 /// A station of which one flank was seen: a boundary of the scan.

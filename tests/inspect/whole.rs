@@ -275,7 +275,7 @@ fn d_along_the_normal_is_what_the_qif_sample_states() {
         offset_mm: (measured - point).dot(n),
         tilt: 0.0,
         slope: 0.0,
-        bend: 0.0,
+        second: [0.0; 3],
         covariance: [[0.0; 2]; 2],
         sigma_mm: 0.0,
         points: 100,

@@ -98,7 +98,7 @@ fn found(section: &Section, cut: f64, seed: u64) -> Option<EdgeBreak> {
                     offset_mm: a * x,
                     tilt: b * x + (covariance[1][1] - b * b).sqrt() * y,
                     slope: 0.0,
-                    bend: 0.0,
+                    second: [0.0; 3],
                     covariance,
                     sigma_mm: SIGMA,
                     points: 100,

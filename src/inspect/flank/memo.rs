@@ -21,6 +21,8 @@ pub struct Memo {
     three: Fits<3>,
     four: Fits<4>,
     five: Fits<5>,
+    six: Fits<6>,
+    seven: Fits<7>,
     choice: u64,
 }
 
@@ -36,6 +38,8 @@ impl Memo {
             self.three.retain(|key, _| is_of(key, choice));
             self.four.retain(|key, _| is_of(key, choice));
             self.five.retain(|key, _| is_of(key, choice));
+            self.six.retain(|key, _| is_of(key, choice));
+            self.seven.retain(|key, _| is_of(key, choice));
         }
     }
 
@@ -72,7 +76,9 @@ impl Memo {
         let fits: &mut dyn Any = match P {
             3 => &mut self.three,
             4 => &mut self.four,
-            _ => &mut self.five,
+            5 => &mut self.five,
+            6 => &mut self.six,
+            _ => &mut self.seven,
         };
         fits.downcast_mut()
     }

@@ -192,3 +192,42 @@ fn flanks_without_enough_data_say_why() {
             .any(|f| matches!(f, Err(FlankGap::TooFew(n, 12)) if *n < 12))
     );
 }
+
+/// Twist and bow of a face that a plane and a bend do not hold; the offset is that at the middle of the station, which a mean over the
+/// window would miss by 0.2 * 1 / 12 = 17 micrometres.
+#[test]
+fn a_twisted_and_bowed_flank_is_measured_as_a_quadric() {
+    let quadric = |r: f64, s: f64, _: &mut Noise| {
+        let along = s - s.floor() - 0.5;
+        0.01 * r * along + 0.2 * along * along
+    };
+    let points = scan(&Scene {
+        seed: 1,
+        line_sigma: 0.0,
+        extra: quadric,
+    });
+    let flank = measure_flank(&points, &WINDOWS, &SETTINGS);
+    assert_eq!(flank.model, FlankModel::Quadric);
+    let fit = flank.stations[7].expect("a full flank");
+    assert!((fit.second[2] - 0.2).abs() < 0.02, "{:?}", fit.second);
+    assert_honest("quadric", z_scores(0.0, quadric));
+}
+
+#[test]
+fn noise_shared_by_a_scan_line_is_no_quadric() {
+    let shared = |line_sigma| {
+        let points = |seed| {
+            let extra = |_, _, _: &mut Noise| 0.0;
+            scan(&Scene {
+                seed,
+                line_sigma,
+                extra,
+            })
+        };
+        let model = |seed| measure_flank(&points(seed), &WINDOWS, &SETTINGS).model;
+        (1..=20)
+            .filter(|seed| model(*seed) == FlankModel::Quadric)
+            .count()
+    };
+    assert_eq!((shared(0.0), shared(0.008)), (0, 0));
+}

@@ -63,7 +63,7 @@ impl Noise {
     }
 
     /// Covariance of all coefficients. Lines and cells overlap, so the larger of the two counts, not their sum.
-    fn full<const P: usize>(&self, window: &WindowFit<P>) -> [[f64; P]; P] {
+    pub(super) fn full<const P: usize>(&self, window: &WindowFit<P>) -> [[f64; P]; P] {
         let cofactor = &window.fit.cofactor;
         let of = |component: f64, scatter: &[[f64; P]; P]| -> [[f64; P]; P] {
             std::array::from_fn(|i| {
