@@ -48,9 +48,9 @@ use characteristic::{EdgeValues, at_station, characteristics};
 use compare::Scanned;
 use corner::CornerSettings;
 use measure::{MeasureSettings, MeasuredEdge, measure_edges_stepped};
-use monte_carlo::{Trials, measure_edges_drawn};
+use monte_carlo::{Derivation, StationTrials, Trials, measure_edges_drawn};
 use quantity::{Extent, Limits, Quantity};
-use recipe::{EdgeFacts, EdgeKey, Resolved};
+use recipe::{EdgeFacts, EdgeKey, GapRecipe, Resolved};
 use result::{Alignment, EdgeResult, GapResult, ScanEstimate, StationResult, Verdict};
 use verdict::judge;
 
@@ -83,7 +83,7 @@ pub enum Uncertainty {
     /// By first derivatives (JCGM 100).
     #[default]
     FirstOrder,
-    /// By trials (JCGM 101): of d1, d2, the total, the included angle and edge breaks; the rest by first derivatives.
+    /// By trials (JCGM 101): all but the ridge, the edge at depth, the means of edges and boundaries, which are of first order.
     MonteCarlo(MonteCarlo),
 }
 
@@ -151,8 +151,9 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         Uncertainty::MonteCarlo(how) => {
             let given = (&settings, &steps[..]);
             let told = request.trials_done;
-            let (edges, trials) = measure_edges_drawn(&part, &places, &surface, given, how, told);
-            (edges, Some(trials))
+            let (edges, trials, kept) =
+                measure_edges_drawn(&part, &places, &surface, given, how, told);
+            (edges, Some((trials, kept)))
         }
     };
     stages.begin("comparison of edges found");
@@ -247,7 +248,7 @@ struct Taken {
     findings: Vec<String>,
     measured: Vec<MeasuredEdge>,
     compared: compare::Compared,
-    trials: Option<Trials>,
+    trials: Option<(Trials, StationTrials)>,
     estimate: ScanEstimate,
 }
 
@@ -264,9 +265,11 @@ fn judge_all<B: Body>(
         mut findings,
         measured,
         compared,
-        ..
+        trials,
+        estimate,
     } = taken;
-    let results: Vec<EdgeResult> = edges
+    let recipe = request.recipe;
+    let mut results: Vec<EdgeResult> = edges
         .iter()
         .zip(measured)
         .zip(resolved)
@@ -275,18 +278,48 @@ fn judge_all<B: Body>(
             judged(edge, measured, asked, request.recipe)
         })
         .collect();
-    let corners = corner::measure(
+    let corner_settings = CornerSettings {
+        limit_mm: recipe.corner_mm,
+        rule: recipe.rule,
+        pose_covariance: &alignment.covariance,
+        u_calibration_mm: recipe.u_calibration_mm,
+    };
+    let nominal_corners = corner::corners(nominal, edges);
+    let mut corners = corner::measure(
         nominal,
-        &corner::corners(nominal, edges),
+        &nominal_corners,
         (edges, &results),
-        &CornerSettings {
-            limit_mm: request.recipe.corner_mm,
-            rule: request.recipe.rule,
-            pose_covariance: &alignment.covariance,
-            u_calibration_mm: request.recipe.u_calibration_mm,
-        },
+        &corner_settings,
     );
-    let gaps = gaps(edges, &results, request.recipe, &mut findings);
+    let asked_gaps = asked_gaps(edges, recipe, &mut findings);
+    let mut gaps: Vec<GapResult> = asked_gaps
+        .iter()
+        .map(|(asked, [a, b])| gap::measure(asked, [&results[*a], &results[*b]], recipe.rule))
+        .collect();
+    if let Some((_, kept)) = &trials {
+        let derivation = Derivation {
+            body: nominal,
+            edges,
+            recipe,
+            corners: &nominal_corners,
+            corner_settings,
+            gaps: &asked_gaps,
+        };
+        let forms = kept.take_over(&derivation, &results, (&mut corners, &mut gaps));
+        for ((result, form), (edge, asked)) in results
+            .iter_mut()
+            .zip(forms)
+            .zip(edges.iter().zip(resolved))
+        {
+            result.form = form;
+            judge_edge(result, edge, asked, recipe);
+        }
+        corners
+            .iter_mut()
+            .for_each(|c| corner::judge_again(c, recipe.rule));
+        gaps.iter_mut()
+            .for_each(|g| gap::judge_again(g, recipe.rule));
+    }
     let values = results
         .iter()
         .map(|e| e.verdict)
@@ -303,10 +336,10 @@ fn judge_all<B: Body>(
         unexpected_edges: compared.unexpected,
         missing_edges: compared.missing,
         verdict,
-        trials: taken.trials,
+        trials: trials.map(|(trials, _)| trials),
         seconds: stages.end(),
         findings,
-        scan: Some(taken.estimate),
+        scan: Some(estimate),
     }
 }
 
@@ -424,12 +457,12 @@ fn environment_verdict(request: &Request<'_>, findings: &mut Vec<String>) -> Opt
     Some(Verdict::NotDecidable)
 }
 
-fn gaps(
+/// The gaps of the recipe with the indices of their edges; one whose edges are not there becomes a finding.
+fn asked_gaps<'a>(
     edges: &[BodyEdge],
-    results: &[EdgeResult],
-    recipe: &Recipe,
+    recipe: &'a Recipe,
     findings: &mut Vec<String>,
-) -> Vec<GapResult> {
+) -> Vec<(&'a GapRecipe, [usize; 2])> {
     let find = |key: &EdgeKey| {
         edges.iter().position(|edge| match key {
             EdgeKey::Entity(entity) => *entity == edge.entity,
@@ -440,7 +473,7 @@ fn gaps(
     for asked in &recipe.gaps {
         match [find(&asked.edges[0]), find(&asked.edges[1])] {
             [Some(a), Some(b)] if a != b => {
-                gaps.push(gap::measure(asked, [&results[a], &results[b]], recipe.rule));
+                gaps.push((asked, [a, b]));
             }
             _ => findings.push(format!(
                 "recipe: gap {:?}: {:?} are not two sharp edges of the nominal, expected their ids or entities; the gap is left out",
@@ -499,46 +532,51 @@ fn judged(
     };
     let coverage = share(&|s| s.measured.is_some());
     let boundary_share = share(&|s| s.boundary.is_some());
-    // Where limits ask for nothing but what a boundary shows, its stations answer for the edge.
-    let asked_here: Vec<Quantity> = Quantity::all()
-        .filter(|q| q.extent() == Extent::Station && asked.limits.of(*q).is_some())
-        .collect();
-    let answered = share(&|s| {
-        s.measured.is_some()
-            || (s.boundary.is_some()
-                && !asked_here.is_empty()
-                && asked_here
-                    .iter()
-                    .all(|q| at_station(s, edge.kind, *q).is_some()))
-    });
-    let form = form::form(&stations, recipe.direction_mm);
-    let values = EdgeValues {
-        kind: edge.kind,
-        stations: &stations,
-        breaks: &measured.breaks,
-        form: form.as_ref(),
-    };
-    let characteristics = characteristics(&values, &asked.limits, recipe.rule);
-    let verdict = verdict::judge_edge(
-        characteristics.iter().map(|c| c.verdict),
-        answered,
-        recipe.minimum_coverage,
-        !asked.limits.is_empty(),
-    );
-    EdgeResult {
+    let mut result = EdgeResult {
         id: asked.name.clone().unwrap_or_else(|| edge.id.clone()),
         nominal_entity: edge.entity,
         kind: edge.kind,
         length_mm: edge.length_mm,
         coverage,
         boundary_share,
+        form: form::form(&stations, recipe.direction_mm),
         stations,
         breaks: measured.breaks,
-        form,
-        characteristics,
+        characteristics: Vec::new(),
         mean: measured.mean,
-        verdict,
-    }
+        verdict: Verdict::Undefined,
+    };
+    judge_edge(&mut result, edge, asked, recipe);
+    result
+}
+
+/// The characteristics of an edge and its verdict.
+fn judge_edge(result: &mut EdgeResult, edge: &BodyEdge, asked: &Resolved, recipe: &Recipe) {
+    // Where limits ask for nothing but what a boundary shows, its stations answer for the edge.
+    let asked_here: Vec<Quantity> = Quantity::all()
+        .filter(|q| q.extent() == Extent::Station && asked.limits.of(*q).is_some())
+        .collect();
+    let answers = |s: &&StationResult| {
+        let shown = |q: &Quantity| at_station(s, edge.kind, *q).is_some();
+        let boundary = s.boundary.is_some() && !asked_here.is_empty();
+        s.measured.is_some() || (boundary && asked_here.iter().all(shown))
+    };
+    let total = result.stations.len().max(1) as f64;
+    let answered = result.stations.iter().filter(answers).count() as f64 / total;
+    let values = EdgeValues {
+        kind: edge.kind,
+        stations: &result.stations,
+        breaks: &result.breaks,
+        form: result.form.as_ref(),
+    };
+    let characteristics = characteristics(&values, &asked.limits, recipe.rule);
+    result.verdict = verdict::judge_edge(
+        characteristics.iter().map(|c| c.verdict),
+        answered,
+        recipe.minimum_coverage,
+        !asked.limits.is_empty(),
+    );
+    result.characteristics = characteristics;
 }
 
 /// The worst verdict on the values of a station, and the reason where it is `NotDecidable`.

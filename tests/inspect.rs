@@ -7,6 +7,8 @@
 
 #[path = "inspect/solids.rs"]
 mod solids;
+#[path = "inspect/trials.rs"]
+mod trials;
 #[path = "inspect/whole.rs"]
 mod whole;
 

@@ -7,7 +7,7 @@ use glam::{DMat3, DVec3};
 use super::body::{Body, BodyEdge};
 use super::contributions::quadratic;
 use super::measure::pose_row;
-use super::result::{CornerResult, EdgeResult, Quantified, StationResult};
+use super::result::{CornerResult, EdgeResult, Quantified, StationResult, Verdict};
 use super::verdict::{Rule, judge};
 
 /// Edges whose ends lie within this share of the part's size meet in one corner: CAD files leave gaps of a micrometre.
@@ -112,12 +112,7 @@ pub fn measure<B: Body>(
                 total_mm: None,
                 residual_mm: None,
                 limit_mm: settings.limit_mm,
-                verdict: judge(
-                    f64::NAN,
-                    0.0,
-                    settings.limit_mm.map(|l| [f64::NEG_INFINITY, l]),
-                    settings.rule,
-                ),
+                verdict: Verdict::Undefined,
                 reason: String::new(),
             };
             let deviations: Vec<Option<Quantified>> = corner
@@ -134,14 +129,24 @@ pub fn measure<B: Body>(
                     result.measured = Some(corner.point + shift);
                     result.total_mm = Some(total);
                     result.residual_mm = residual;
-                    let limits = settings.limit_mm.map(|l| [f64::NEG_INFINITY, l]);
-                    result.verdict = judge(total.value, total.u, limits, settings.rule);
                 }
                 Err(reason) => result.reason = reason,
             }
+            judge_again(&mut result, settings.rule);
             result
         })
         .collect()
+}
+
+/// The verdict on a corner as it stands: one that was not measured keeps no limit.
+pub fn judge_again(corner: &mut CornerResult, rule: Rule) {
+    let unknown = Quantified {
+        value: f64::NAN,
+        u: 0.0,
+    };
+    let total = corner.total_mm.unwrap_or(unknown);
+    let limits = corner.limit_mm.map(|limit| [f64::NEG_INFINITY, limit]);
+    corner.verdict = judge(total.value, total.u, limits, rule);
 }
 
 /// The deviation of `face` at the corner: from each edge on it that ends here, a line through d over its nearest stations; their mean by

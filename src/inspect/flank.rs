@@ -109,6 +109,8 @@ pub struct Design {
     pub influence: Vec<[f64; 2]>,
     /// Groups of points that share noise: (group, influence of the group).
     pub groups: Vec<(u32, [f64; 2])>,
+    /// Whether the groups are scan lines, which go on beyond the station.
+    pub groups_are_lines: bool,
     /// Standard deviations of a point's own and of its group's noise, mm.
     pub sigma_mm: [f64; 2],
 }

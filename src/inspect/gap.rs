@@ -20,33 +20,39 @@ pub fn measure(recipe: &GapRecipe, edges: [&EdgeResult; 2], rule: Rule) -> GapRe
         .iter()
         .filter_map(|a| at_station(a, &edges[1].stations))
         .collect();
-    let worst = |value: fn(&GapStation) -> Quantified, limits: Option<[f64; 2]>| {
-        stations
-            .iter()
-            .map(|s| {
-                let v = value(s);
-                judge(v.value, v.u, limits, rule)
-            })
-            .fold(Verdict::Undefined, Verdict::max)
-    };
-    let mut verdict =
-        worst(|s| s.gap_mm, recipe.gap_mm).max(worst(|s| s.flush_mm, recipe.flush_mm));
-    let mut reason = String::new();
-    if stations.is_empty() {
-        reason = "at no station both edges were measured opposite each other".to_owned();
-        if recipe.gap_mm.is_some() || recipe.flush_mm.is_some() {
-            verdict = Verdict::NotDecidable;
-        }
-    }
-    GapResult {
+    let mut gap = GapResult {
         name: recipe.name.clone(),
         edges: edges.map(|e| e.id.clone()),
         stations,
         gap_limits_mm: recipe.gap_mm,
         flush_limits_mm: recipe.flush_mm,
-        verdict,
-        reason,
+        verdict: Verdict::Undefined,
+        reason: String::new(),
+    };
+    if gap.stations.is_empty() {
+        gap.reason = "at no station both edges were measured opposite each other".to_owned();
     }
+    judge_again(&mut gap, rule);
+    gap
+}
+
+/// The verdict on a gap as it stands: the worst of its stations'; limits of a gap that was nowhere measured are not decidable.
+pub fn judge_again(gap: &mut GapResult, rule: Rule) {
+    let worst = |value: fn(&GapStation) -> Quantified, limits: Option<[f64; 2]>| {
+        gap.stations
+            .iter()
+            .map(|s| judge(value(s).value, value(s).u, limits, rule))
+            .fold(Verdict::Undefined, Verdict::max)
+    };
+    let [by_gap, by_flush] = [
+        worst(|s| s.gap_mm, gap.gap_limits_mm),
+        worst(|s| s.flush_mm, gap.flush_limits_mm),
+    ];
+    let limited = gap.gap_limits_mm.is_some() || gap.flush_limits_mm.is_some();
+    gap.verdict = match gap.stations.is_empty() && limited {
+        true => Verdict::NotDecidable,
+        false => by_gap.max(by_flush),
+    };
 }
 
 fn at_station(a: &StationResult, others: &[StationResult]) -> Option<GapStation> {

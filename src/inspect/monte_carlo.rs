@@ -4,10 +4,13 @@
 //! calibration, the part's temperature and expansion - and runs the measurement on them: the flank fits, the exact intersection with the
 //! curved faces, the exact motion and growth. Trials are drawn in blocks until the results stand still.
 //!
-//! Edge breaks are drawn as well, in a tenth of the trials: see [`super::edge_break`].
+//! Edge breaks are drawn as well, in a tenth of the trials (see [`super::edge_break`]), and what follows from whole edges - form, corners,
+//! gaps - from as many trials of all stations together.
 //!
 //! Source: JCGM 101:2008, 5.9 and 7.9 (adaptive procedure). We differ: which points a flank uses is kept from the measurement, and the
 //! values stay those of the measurement: the trials give their uncertainty.
+
+mod derived;
 
 use glam::{DQuat, DVec3};
 use nalgebra::{Matrix6, SymmetricEigen};
@@ -23,6 +26,9 @@ use super::measuring::{Measuring, centre};
 use super::result::Measured;
 use crate::nominal::Station;
 use crate::points::PointCloud;
+
+pub(super) use derived::Derivation;
+pub use derived::StationTrials;
 
 /// How many trials, and from which numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,6 +89,8 @@ pub struct Trials {
     pub unstable: usize,
     /// Most trials of an edge break.
     pub breaks: usize,
+    /// Trials of form, corners and gaps.
+    pub derived: usize,
 }
 
 /// A value as its trials show it, in the unit of the field that holds it.
@@ -122,7 +130,10 @@ pub fn measure_monte_carlo<B: Body>(
     let pose = root(&settings.pose_covariance);
     let layers = [Layer::new(cloud, places)];
     let flanks = with_designs(&layers, surface, (settings, &[]));
-    let draw = |e: usize, k: usize| station(&flanks, settings, &pose, how, (e, k));
+    let draw = |e: usize, k: usize| {
+        let drawn = station(&flanks, settings, &pose, (how, 0), (e, k));
+        drawn.map(|(drawn, _)| drawn)
+    };
     (0..flanks.measuring.series().len())
         .map(|e| {
             (0..flanks.measuring.windows()[e].count)
@@ -154,7 +165,7 @@ fn with_designs<'a, B: Body>(
 }
 
 /// As [`super::measure::measure_edges_stepped`], with the uncertainties of d1, d2, the total, the included angle and the edge breaks from
-/// trials. `told` hears how many edges of how many are done.
+/// trials, and the first trials of every station. `told` hears how many edges of how many are done.
 pub fn measure_edges_drawn<B: Body>(
     cloud: &PointCloud,
     places: &[Place],
@@ -162,18 +173,22 @@ pub fn measure_edges_drawn<B: Body>(
     (settings, steps_mm): (&MeasureSettings, &[Option<f64>]),
     how: &MonteCarlo,
     told: &(dyn Fn(usize, usize) + Sync),
-) -> (Vec<MeasuredEdge>, Trials) {
+) -> (Vec<MeasuredEdge>, Trials, StationTrials) {
     let pose = root(&settings.pose_covariance);
     let layers = [Layer::new(cloud, places)];
     let mut flanks = with_designs(&layers, surface, (settings, steps_mm));
     let zones = flanks.measuring.zones(&layers);
     let breaks = flanks.measuring.breaks(&layers);
     let (flanks, measuring) = (&flanks, &flanks.measuring);
+    let all: usize = measuring.windows().iter().map(|w| w.count).sum();
+    let keep = StationTrials::count(how.break_trials(), all);
+    let mut kept = StationTrials::new(keep);
     let mut trials = Trials {
         seed: how.seed,
         stations: [usize::MAX, 0],
         unstable: 0,
         breaks: 0,
+        derived: keep,
     };
     let count = measuring.series().len();
     let mut edges = Vec::with_capacity(count);
@@ -182,11 +197,14 @@ pub fn measure_edges_drawn<B: Body>(
         let context = measuring.context(e, settings, flanks.centre);
         let (windows, series) = (&measuring.windows()[e], &measuring.series()[e]);
         let mut edge = context.combine(windows, series, &breaks[e]);
-        let drawn: Vec<Option<DrawnStation>> = (0..windows.count)
+        let drawn: Vec<Option<(DrawnStation, Vec<[f64; 2]>)>> = (0..windows.count)
             .into_par_iter()
-            .map(|k| station(flanks, settings, &pose, how, (e, k)))
+            .map(|k| station(flanks, settings, &pose, (how, keep), (e, k)))
             .collect();
+        let mut first = Vec::with_capacity(windows.count);
         for (station, drawn) in edge.stations.iter_mut().zip(drawn) {
+            let (drawn, d_mm) = drawn.unzip();
+            first.push(d_mm.unwrap_or_default());
             if let (Ok(measured), Some(drawn)) = (&mut station.outcome, drawn) {
                 take_over(measured, &drawn);
                 trials.stations[0] = trials.stations[0].min(drawn.trials);
@@ -208,10 +226,11 @@ pub fn measure_edges_drawn<B: Body>(
             trials.breaks = trials.breaks.max(drawn.trials);
         }
         edges.push(edge);
+        kept.push(first);
     }
     told(count, count);
     trials.stations[0] = trials.stations[0].min(trials.stations[1]);
-    (edges, trials)
+    (edges, trials, kept)
 }
 
 /// The standard uncertainties of a station by its trials. That of the total is about its value: near zero, where a distance cannot fall
@@ -222,6 +241,9 @@ fn take_over(measured: &mut Measured, drawn: &DrawnStation) {
     let bias = drawn.total_mm.mean - measured.total_mm.value;
     measured.total_mm.u = drawn.total_mm.u.hypot(bias);
 }
+
+/// Marks the seeds of draws that belong to a face, apart from those of stations and edge breaks.
+const FACE: u64 = 1 << 62;
 
 /// The seed of a place's own draws.
 fn own_seed(seed: u64, place: u64) -> u64 {
@@ -237,18 +259,20 @@ fn root(covariance: &[[f64; 6]; 6]) -> [[f64; 6]; 6] {
     std::array::from_fn(|i| std::array::from_fn(|j| root[(i, j)]))
 }
 
+/// Station `k` of edge `e` by its trials, and d1 and d2 of the first `keep` of them, mm.
 fn station<B: Body>(
     flanks: &Flanks<'_, B>,
     settings: &MeasureSettings,
     pose: &[[f64; 6]; 6],
-    how: &MonteCarlo,
+    (how, keep): (&MonteCarlo, usize),
     (e, k): (usize, usize),
-) -> Option<DrawnStation> {
+) -> Option<(DrawnStation, Vec<[f64; 2]>)> {
     let pair = &flanks.measuring.series()[e];
     let (Ok(first), Ok(second)) = (&pair[0].stations[k], &pair[1].stations[k]) else {
         return None;
     };
     let context = flanks.measuring.context(e, settings, flanks.centre);
+    let faces = context.edge.faces;
     let model = Model {
         station: context.station(&flanks.measuring.windows()[e], k),
         context,
@@ -258,6 +282,7 @@ fn station<B: Body>(
         pose,
     };
     model.trial(&mut Inputs::none())?;
+    let mut first = Vec::with_capacity(keep);
     let mut trials: [Vec<f64>; 4] = Default::default();
     let mut blocks: Vec<[Drawn; 4]> = Vec::new();
     let mut stable = false;
@@ -269,9 +294,14 @@ fn station<B: Body>(
             let mut inputs = Inputs {
                 shared: Some(Draws::new(how.seed, t as u64)),
                 own: Some(Draws::new(own_seed(how.seed, place), t as u64)),
+                faces: faces
+                    .map(|face| Some((own_seed(how.seed, FACE | u64::from(face)), t as u64))),
             };
             // Flanks that a draw makes parallel have no edge; one that was measured is far from it.
             if let Some(values) = model.trial(&mut inputs) {
+                if t < keep {
+                    first.push([values[0], values[1]]);
+                }
                 for (list, value) in trials.iter_mut().zip(values) {
                     list.push(value);
                 }
@@ -282,13 +312,14 @@ fn station<B: Body>(
         stable = stands_still(&blocks, how.digits);
     }
     let all = trials.each_ref().map(|list| summary(list, how.probability));
-    Some(DrawnStation {
+    let drawn = DrawnStation {
         d_mm: [all[0], all[1]],
         included_angle_rad: all[2],
         total_mm: all[3],
         trials: trials[0].len(),
         stable,
-    })
+    };
+    Some((drawn, first))
 }
 
 fn summary(values: &[f64], probability: f64) -> Drawn {
@@ -351,10 +382,12 @@ struct Model<'a, B: Body> {
     pose: &'a [[f64; 6]; 6],
 }
 
-/// What a trial draws from: the inputs that all stations share, and the station's own.
+/// What a trial draws from: the inputs that all stations share, the station's own, and by flank the seed and the trial of what the stations
+/// on its face share: the calibration, which errs alike in one direction, and the noise of scan lines.
 struct Inputs {
     shared: Option<Draws>,
     own: Option<Draws>,
+    faces: [Option<(u64, u64)>; 2],
 }
 
 impl Inputs {
@@ -363,22 +396,54 @@ impl Inputs {
         Self {
             shared: None,
             own: None,
+            faces: [None; 2],
         }
+    }
+
+    /// What all stations on the face of flank `i` share, by a number.
+    fn of_face(&self, i: usize, what: u64) -> f64 {
+        self.faces[i].map_or(0.0, |(seed, t)| {
+            Draws::new(own_seed(seed, what), t).normal()
+        })
     }
 
     fn shared(&mut self) -> f64 {
         self.shared.as_mut().map_or(0.0, Draws::normal)
     }
+
+    /// What new noise on all points of the fit of flank `i` adds to (offset, tilt).
+    fn redraw(&mut self, design: &Design, i: usize) -> [f64; 2] {
+        let mut sum = [0.0; 2];
+        let mut add = |influence: &[f64; 2], noise: f64| {
+            sum[0] += influence[0] * noise;
+            sum[1] += influence[1] * noise;
+        };
+        let [alone, together] = design.sigma_mm;
+        let Some(own) = &mut self.own else { return sum };
+        for influence in &design.influence {
+            add(influence, alone * own.normal());
+        }
+        for (group, influence) in &design.groups {
+            let noise = match design.groups_are_lines {
+                true => self.faces[i].map_or(0.0, |(seed, t)| {
+                    Draws::new(own_seed(seed, u64::from(*group)), t).normal()
+                }),
+                false => own.normal(),
+            };
+            add(influence, together * noise);
+        }
+        sum
+    }
 }
+
+/// The calibration among what a face shares; scan lines have the smaller numbers.
+const CALIBRATION: u64 = 1 << 33;
 
 impl<B: Body> Model<'_, B> {
     /// d1, d2, the included angle and the total.
     fn trial(&self, inputs: &mut Inputs) -> Option<[f64; 4]> {
         let drawn: [FlankFit; 2] = std::array::from_fn(|i| {
-            let [offset, tilt] = inputs
-                .own
-                .as_mut()
-                .map_or([0.0; 2], |own| redraw(self.designs[i], own));
+            let [offset, tilt] = inputs.redraw(self.designs[i], i);
             FlankFit {
                 offset_mm: self.fits[i].offset_mm + offset,
                 tilt: self.fits[i].tilt + tilt,
@@ -402,28 +467,11 @@ impl<B: Body> Model<'_, B> {
         }
         let d = [0, 1].map(|i| {
             (p - self.station.point).dot(self.station.normals[i])
-                + self.settings.u_calibration_mm * inputs.shared()
+                + self.settings.u_calibration_mm * inputs.of_face(i, CALIBRATION)
         });
         let angle = edge.included_angle_rad + self.settings.u_calibration_rad * inputs.shared();
         Some([d[0], d[1], angle, across(&self.station, d)])
     }
-}
-
-/// What new noise on all points of a fit adds to (offset, tilt).
-fn redraw(design: &Design, draws: &mut Draws) -> [f64; 2] {
-    let mut sum = [0.0; 2];
-    let mut add = |influence: &[f64; 2], sigma: f64| {
-        let noise = sigma * draws.normal();
-        sum[0] += influence[0] * noise;
-        sum[1] += influence[1] * noise;
-    };
-    for influence in &design.influence {
-        add(influence, design.sigma_mm[0]);
-    }
-    for (_, influence) in &design.groups {
-        add(influence, design.sigma_mm[1]);
-    }
-    sum
 }
 
 /// Normal numbers from a counter: SplitMix64 and the polar form of Box and Muller.

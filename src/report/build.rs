@@ -237,6 +237,7 @@ fn uncertainty_from_trials(trials: Option<Trials>) -> wire::Uncertainty {
         },
         trials: trials.map(|t| t.stations),
         break_trials: trials.map(|t| t.breaks),
+        derived_trials: trials.map(|t| t.derived),
         seed: trials.map(|t| t.seed),
         unstable_stations: trials.map(|t| t.unstable),
     }

@@ -65,12 +65,15 @@ pub struct Report {
 /// How uncertainties were propagated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 pub struct Uncertainty {
-    /// Of d1, d2, the total, the included angle and the edge breaks; all others are of first order.
+    /// Of all values but the ridge, the edge at depth, the means of edges and boundaries, which are of first order.
     pub method: UncertaintyMethod,
     /// Fewest and most trials of a station; null for first order.
     pub trials: Option<[usize; 2]>,
     /// Most trials of an edge break.
     pub break_trials: Option<usize>,
+    /// Trials of form, corners and gaps.
+    #[serde(default)]
+    pub derived_trials: Option<usize>,
     /// Seed of the trials.
     pub seed: Option<u64>,
     /// Stations whose values did not stand still to two digits of u when the trials ended.

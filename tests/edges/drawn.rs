@@ -34,7 +34,7 @@ fn both(shape: Break) -> (MeasuredEdge, MeasuredEdge, Trials) {
     let places = surface.places(&cloud, 2.0);
     let how = MonteCarlo::of_trials(TRIALS);
     let given = (&settings, &[][..]);
-    let (mut drawn, trials) =
+    let (mut drawn, trials, _) =
         measure_edges_drawn(&cloud, &places, &surface, given, &how, &|_, _| {});
     let mut first = measure_edges(&cloud, &places, &surface, &settings);
     (

@@ -95,7 +95,7 @@ fn corners_are_where_the_made_faces_meet() {
 }
 
 /// A U: the two arms face each other across a slot of 10 mm, and end on one height.
-const SLOT: [(f64, f64); 8] = [
+pub(crate) const SLOT: [(f64, f64); 8] = [
     (0.0, 0.0),
     (30.0, 0.0),
     (30.0, 10.0),

@@ -58,6 +58,7 @@ impl Noise {
         Design {
             influence,
             groups: groups.into_iter().collect(),
+            groups_are_lines: by_line,
             sigma_mm: [self.white, component].map(|v| (v * form).sqrt()),
         }
     }

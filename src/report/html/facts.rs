@@ -163,6 +163,13 @@ fn write_uncertainty(out: &mut String, used: &Uncertainty) -> fmt::Result {
             if let Some(trials) = used.break_trials {
                 row(out, "trials of an edge break", &grouped(trials as u64))?;
             }
+            if let Some(trials) = used.derived_trials {
+                row(
+                    out,
+                    "trials of form, corners, gaps",
+                    &grouped(trials as u64),
+                )?;
+            }
             if let Some(seed) = used.seed {
                 row(out, "seed", &seed.to_string())?;
             }
