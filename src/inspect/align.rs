@@ -316,7 +316,7 @@ impl<'a, B: Body> Task<'a, B> {
         let observations =
             self.observe(&RigidTransform::IDENTITY, &indices, 0.1 * self.size_mm, 0.0);
         let sum: f64 = observations.iter().map(|o| o.residual_mm.powi(2)).sum();
-        Aligned {
+        self.off_datums(Aligned {
             alignment: Alignment {
                 part_from_machine: RigidTransform::IDENTITY,
                 rms_mm: (sum / observations.len().max(1) as f64).sqrt(),
@@ -327,16 +327,10 @@ impl<'a, B: Body> Task<'a, B> {
                 method: Method::AsGiven,
                 ..self.unexplained()
             },
-            findings: if self.options.datums.is_empty() {
-                Vec::new()
-            } else {
-                vec![
-                    "alignment: the scan is taken as it lies, so that the recipe's datums hold nothing; ask for an alignment".to_owned(),
-                ]
-            },
+            findings: Vec::new(),
             conclusion: Conclusion::AsGiven,
             eigenvalues: [0.0; 6],
-        }
+        })
     }
 
     /// The poses that the scene fits, best first; none where too few points lie near the nominal.

@@ -144,6 +144,34 @@ impl<B: Body> Task<'_, B> {
         aligned
     }
 
+    /// A scan that is taken as it lies, with how far each datum feature asked for lies off its nominal: they hold nothing.
+    pub(super) fn off_datums(&self, mut aligned: Aligned) -> Aligned {
+        let features = self.options.datums;
+        if features.is_empty() {
+            return aligned;
+        }
+        let pose = aligned.alignment.part_from_machine;
+        let seen = self.seen(&pose);
+        for feature in features {
+            match self.measure(feature, &pose, &seen) {
+                Ok(found) => {
+                    let datum = self.described_datum(feature, &found, &pose);
+                    aligned.alignment.datums.push(datum);
+                }
+                Err(why) => {
+                    let finding = format!("alignment: datum {:?}: {why}", feature.name);
+                    aligned.findings.push(finding);
+                }
+            }
+        }
+        aligned.findings.push(
+            "alignment: the scan is taken as it lies: the recipe's datums hold nothing, and their residuals say how far they lie off; ask for an \
+             alignment to rest on them"
+                .to_owned(),
+        );
+        aligned
+    }
+
     /// The points on faces, away from edges.
     fn seen(&self, pose: &RigidTransform) -> Vec<Seen> {
         let cloud = self.scan.cloud;
