@@ -17,6 +17,7 @@ use acies::inspect::flank::FlankModel;
 use acies::inspect::measure::{Expansion, MeasureSettings, MeasuredEdge, measure_edges};
 use acies::inspect::monte_carlo::{MonteCarlo, measure_monte_carlo};
 use acies::inspect::result::{BreakShape, Measured, Quantified};
+use acies::inspect::virtual_edge::nominal_angle;
 use acies::nominal::EdgeKind;
 use acies::points::PointCloud;
 use freeform::FreeForm;
@@ -191,6 +192,34 @@ fn a_free_form_edge_is_measured_as_well() {
         count += 1;
     }
     assert!(count >= 7, "{count}");
+}
+
+/// Where a face is off by 0.3 mm the curved faces meet elsewhere than drawn, at another angle than there.
+#[test]
+fn the_included_angle_is_that_where_the_made_faces_meet() {
+    let body = FreeForm::new();
+    let deviation = |i: usize, _: DVec3| [0.3, -0.3][i];
+    let made = Made::new(&body, 0, &deviation, Break::Sharp);
+    let (mut z, mut elsewhere) = (Vec::new(), 0.0);
+    for seed in 1..=6 {
+        let edge = measure(&body, &scan(&made, 8.0, seed), &SETTINGS).swap_remove(0);
+        for station in &edge.stations {
+            let Ok(m) = &station.outcome else { continue };
+            let truth = made.true_angle(&station.station);
+            let kind = body.edges()[0].kind;
+            elsewhere += (truth - nominal_angle(&station.station, kind)) / m.u_included_angle_rad;
+            z.push((m.included_angle_rad - truth) / m.u_included_angle_rad);
+        }
+    }
+    let n = z.len() as f64;
+    let mean = z.iter().sum::<f64>() / n;
+    assert!(n >= 40.0, "{n}");
+    assert!(
+        (elsewhere / n).abs() > 1.0,
+        "the angle must differ: {}",
+        elsewhere / n
+    );
+    assert!(mean.abs() < 3.5 / n.sqrt(), "{mean}");
 }
 
 #[test]

@@ -192,14 +192,16 @@ impl<B: Body> EdgeContext<'_, B> {
         intersect(station, self.edge.kind, flanks, |i, p| {
             let height = (p - station.point).dot(station.normals[i]);
             let Some(foot) = self.body.foot(self.edge.faces[i], p, None) else {
-                return 0.0;
+                return [0.0; 2];
             };
             let sag = height - (p - foot.point).dot(foot.normal);
+            let rise = -foot.normal.dot(station.into_face[i]);
+            let slope = rise / foot.normal.dot(station.normals[i]);
             // A foot on another sheet of the surface says nothing about this place.
-            if sag.abs() < 0.5 * (p - station.point).length() {
-                sag
+            if sag.abs() < 0.5 * (p - station.point).length() && slope.abs() < 0.5 {
+                [sag, slope]
             } else {
-                0.0
+                [0.0; 2]
             }
         })
     }

@@ -96,7 +96,19 @@ impl<'a, B: Body> Made<'a, B> {
     /// True included angle: between the made flanks' directions at the edge.
     pub fn true_angle(&self, station: &Station) -> f64 {
         let v = self.at(station, [0.0; 2]);
-        let nominal = acies::inspect::virtual_edge::nominal_angle(station, self.kind);
+        let across = |i: usize| {
+            let normal = self
+                .body
+                .foot(self.faces[i], v, None)
+                .expect("a foot")
+                .normal;
+            normal.reject_from_normalized(station.tangent)
+        };
+        let turn = across(0).angle_between(across(1));
+        let nominal = match self.kind {
+            EdgeKind::Convex => std::f64::consts::PI - turn,
+            EdgeKind::Concave => std::f64::consts::PI + turn,
+        };
         let step = 1e-3;
         let turned = [0, 1].map(|i| {
             let b = station.into_face[i];

@@ -287,7 +287,7 @@ fn d_along_the_normal_is_what_the_qif_sample_states() {
         &station,
         EdgeKind::Convex,
         [&flanks[0], &flanks[1]],
-        |_, _| 0.0,
+        |_, _| [0.0; 2],
     );
     let edge = edge.expect("two faces at 82 degrees");
     // The sample prints 15 decimals of a difference of numbers near 2460, which are good to 4.5e-13.
