@@ -33,7 +33,7 @@ use form::{form, patch_of};
 use scene::Scene;
 use search::Pose;
 
-pub(super) use again::{LaidPoint, align_again};
+pub(super) use again::{LaidPoint, align_again, settle};
 pub use datum::{Datum, DatumPose, pose_from_datums, pose_from_ordered_datums};
 pub use features::{DatumFeature, DatumPlace};
 pub use twist::Twist;

@@ -3,7 +3,7 @@
 //! The scan comes in pieces. When enough of it is there the pose is found and every piece is laid on the nominal: places, sights from
 //! edges, patches. Flanks and shapes are measured as the points come, and again only where points have joined. At the end the pose is
 //! solved for by all points; the values follow the small motion to it by first order, which for plane faces is exact. Where the motion
-//! is not small, everything is laid again.
+//! is not small, everything is laid again: better on the way than at the end, so that the pose is asked for on the way as well.
 
 use std::collections::HashSet;
 
@@ -12,7 +12,9 @@ use glam::{DMat3, IVec3};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use super::align::{Aligned, Candidates, Conclusion, LaidPoint, Scan, align_again, align_keeping};
+use super::align::{
+    Aligned, Candidates, Conclusion, LaidPoint, Scan, align_again, align_keeping, settle,
+};
 use super::assign::{Place, Surface, towards};
 use super::attention::{CellSet, Outline, Patches};
 use super::body::Body;
@@ -23,7 +25,8 @@ use super::measuring::{Measuring, centre};
 use super::recipe::Resolved;
 use super::result::{Inspection, ScanEstimate, Verdict};
 use super::{
-    Datums, GATE, Request, Stages, Taken, all_edge_facts, judge_all, measure_settings, resolve,
+    Datums, GATE, Request, Stages, Start, Taken, all_edge_facts, judge_all, measure_settings,
+    resolve,
 };
 use crate::geometry::RigidTransform;
 use crate::points::spacing::Estimator;
@@ -37,6 +40,12 @@ const SKETCH_ENOUGH: usize = 1500;
 
 /// The pose is found anew when this many times as many points are there: half of the scan is then laid twice.
 const AGAIN: f64 = 2.2;
+
+/// Whether the base still holds is asked when this many times as many points are there.
+const ASK_AGAIN: f64 = 1.2;
+
+/// Points that say on the way whether the pose has moved.
+const ASKED_POINTS: usize = 30_000;
 
 /// Points that solve for the last pose at most: what that leaves open adds less than a hundredth to the variance of a station.
 const POSE_POINTS: usize = 200_000;
@@ -91,8 +100,9 @@ struct Base<'a, B: Body> {
     outline: Outline,
     patches: Patches,
     measuring: Measuring<'a, B>,
-    /// Points of the scan when the pose was found.
+    /// Points of the scan when the pose was found, and when it was last asked whether it holds.
     points: usize,
+    asked: usize,
 }
 
 /// What is known of an edge while the scan runs. Nothing is judged before its end.
@@ -176,6 +186,7 @@ impl<'a, B: Body> Growing<'a, B> {
 
     /// Measures what has been laid; the edges as they are now.
     pub fn measure(&mut self) -> Vec<EdgeSoFar> {
+        self.ask_base();
         let Some(base) = &mut self.base else {
             return Vec::new();
         };
@@ -353,6 +364,7 @@ impl<'a, B: Body> Growing<'a, B> {
             patches: Patches::default(),
             measuring,
             points: self.points,
+            asked: self.points,
         });
         for piece in 0..self.pieces.len() {
             self.lay(piece);
@@ -391,6 +403,37 @@ impl<'a, B: Body> Growing<'a, B> {
         base.measuring.add(&piece.layer());
     }
 
+    /// Lays everything anew now where it would have to be at the end.
+    fn ask_base(&mut self) {
+        let due = |base: &Base<'_, B>| self.points as f64 > ASK_AGAIN * base.asked as f64;
+        if self.request.start == Start::None || !self.base.as_ref().is_some_and(due) {
+            return;
+        }
+        self.renew_base();
+        // On datum features the pose is not the best fit, which is what is asked for here.
+        if !self.datums.features.is_empty() {
+            return;
+        }
+        let laid = self.laid(ASKED_POINTS);
+        let Some(base) = &mut self.base else { return };
+        let sketch = PointCloud::from_positions(Frame::Machine, Vec::new());
+        let neighbors = Neighbors::new(&[]);
+        let nothing = Scan {
+            cloud: &sketch,
+            neighbors: &neighbors,
+            spacing: base.spacing,
+            noise_mm: base.noise_mm,
+        };
+        base.asked = self.points;
+        let options = self.datums.options(&self.request);
+        let known = (base.pose, &laid[..]);
+        let settled = settle(&nothing, &self.surface, self.request.start, &options, known);
+        if let Some(pose) = settled {
+            // Half of what would be too far at the end: it may go on.
+            self.lay_again(pose, 0.5 * SMALL_MOTION, true);
+        }
+    }
+
     /// Finds a base where there is none, or anew where spacing or noise have turned out otherwise.
     fn renew_base(&mut self) {
         let Some((spacing, noise_mm)) = self.estimator.estimate() else {
@@ -412,18 +455,7 @@ impl<'a, B: Body> Growing<'a, B> {
         let base = self.base.as_ref()?;
         let neighbors = Neighbors::new(&self.sketch.positions);
         let scan = self.sketch_scan(&neighbors, base.noise_mm);
-        let step = self.points.div_ceil(POSE_POINTS).max(1);
-        let laid = |piece: &Piece| {
-            (0..piece.places.len())
-                .step_by(step)
-                .map(|i| LaidPoint {
-                    point: piece.part.positions[i],
-                    place: piece.places[i],
-                    rim_mm: f64::from(piece.rims[i]),
-                })
-                .collect::<Vec<_>>()
-        };
-        let laid: Vec<LaidPoint> = self.pieces.par_iter().flat_map_iter(laid).collect();
+        let laid = self.laid(POSE_POINTS);
         let options = self.datums.options(&self.request);
         Some(align_again(
             &scan,
@@ -435,23 +467,59 @@ impl<'a, B: Body> Growing<'a, B> {
         ))
     }
 
+    /// At most `count` of the points that have been laid, spread over the scan.
+    fn laid(&self, count: usize) -> Vec<LaidPoint> {
+        let step = self.points.div_ceil(count).max(1);
+        let of = |piece: &Piece| {
+            (0..piece.places.len())
+                .step_by(step)
+                .map(|i| LaidPoint {
+                    point: piece.part.positions[i],
+                    place: piece.places[i],
+                    rim_mm: f64::from(piece.rims[i]),
+                })
+                .collect::<Vec<_>>()
+        };
+        self.pieces.par_iter().flat_map_iter(of).collect()
+    }
+
     /// The motion from the base to `pose` if values can follow it; otherwise everything is laid at `pose`.
     fn follow(&mut self, pose: RigidTransform) -> RigidTransform {
         let Some(base) = &self.base else {
             return RigidTransform::IDENTITY;
         };
         let motion = pose * base.pose.inverse();
+        if self.lay_again(pose, SMALL_MOTION, false) {
+            return RigidTransform::IDENTITY;
+        }
+        motion
+    }
+
+    /// Lays everything at `pose` where it is farther from the base than `far` times the noise; the poses that fitted are kept if the scan
+    /// goes on.
+    fn lay_again(&mut self, pose: RigidTransform, far: f64, goes_on: bool) -> bool {
+        let Some(base) = &mut self.base else {
+            return false;
+        };
+        let motion = pose * base.pose.inverse();
         let moved = super::align::Twist::logarithm(&motion).size(self.surface.size_mm());
-        if moved <= SMALL_MOTION * base.noise_mm {
-            return motion;
+        if moved <= far * base.noise_mm {
+            return false;
         }
         tracing::debug!(
             moved_mm = moved,
+            points = self.points,
+            goes_on,
             "the pose has moved too far: all points are laid again"
         );
         let known = (base.spacing, base.noise_mm);
-        self.set_base(pose, known, Vec::new());
-        RigidTransform::IDENTITY
+        let candidates = if goes_on {
+            std::mem::take(&mut base.candidates)
+        } else {
+            Vec::new()
+        };
+        self.set_base(pose, known, candidates);
+        true
     }
 }
 

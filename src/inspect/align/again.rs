@@ -51,6 +51,20 @@ pub(in crate::inspect) fn align_again<B: Body>(
     task.on_datums(aligned)
 }
 
+/// The pose alone by points that were laid on the nominal at `base`, as [`align_again`] finds it; `scan` says how far they lie apart, and
+/// its points are not looked at. `None` where too few lie near.
+pub(in crate::inspect) fn settle<B: Body>(
+    scan: &Scan<'_>,
+    surface: &Surface<'_, B>,
+    start: Start,
+    options: &AlignOptions<'_>,
+    (base, laid): (RigidTransform, &[LaidPoint]),
+) -> Option<RigidTransform> {
+    let task = Task::new(scan, surface, start, options);
+    let (pose, ..) = task.settled(base, laid, scan.spacing.along_mm)?;
+    Some(pose)
+}
+
 impl<B: Body> Task<'_, B> {
     /// The pose by points that were laid on the nominal at `base`: the deviation from a face follows a small motion of its point along
     /// the normal, exactly where the face is plane.
