@@ -3,8 +3,8 @@
 //! where nothing is said.
 //!
 //! What is assumed: a real cell takes for one part the time of the scan, from the first profile to the last by the profilers' own
-//! clocks (9.5 s here), and 20 s to load, clamp and touch it. The simulated devices do not wait; their stamps go by their own rate.
-//! Profiles are 1 mm apart and have 500 columns, so that a part is measured in a fraction of a second; everything else is the demo's
+//! clocks (9.8 s here), and 50 s to load and clamp it and to touch it six times. The simulated devices do not wait; their stamps go by
+//! their own rate. Profiles are 0.8 mm apart and have 500 columns, so that a part is measured in a fraction of a second; everything else is the demo's
 //! cell. In turn for an eighth of the time each the parts are faulty (the demo's defects: not OK) and good (its OK), and between the
 //! eighths all devices are unplugged and come back. Raw data beyond 200 MB are removed by the retention rule. The simulators run in
 //! the same process: its memory and files include theirs.
@@ -19,6 +19,7 @@ mod history;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use acies::cell::DeviceState;
 use acies::report::wire::Status;
 use acies::store::{History, Inspection, Phase, ScanReader, Store};
 use acies_simulators::demo_cell::{DemoCell, DemoOptions};
@@ -26,8 +27,8 @@ use acies_simulators::demo_part::Defects;
 
 use demo::{Played, Running, Taken, acquiring, ended};
 
-/// Loading, clamping, touching, s.
-const HANDLING_S: f64 = 20.0;
+/// Loading and clamping, s, and six touches: a probe that goes up between them, 100 mm a minute towards the part.
+const HANDLING_S: f64 = 20.0 + 30.0;
 /// In so many parts the day is divided.
 const SHIFTS: u32 = 8;
 /// How often something is written down, in hours of the cell.
@@ -38,8 +39,10 @@ fn main() {
     let hours = numbers.first().copied().unwrap_or(24.0);
     let stored = numbers.get(1).map_or(1_000_000, |count| *count as i64);
     let folder = demo::files("day", |text| {
-        let coarse = "encoder_step = 500\ncolumns = 500\nrate_hz = 10.0";
+        let coarse = "encoder_step = 400\ncolumns = 500\nrate_hz = 12.0";
         let text = text.replace("encoder_step = 200", coarse);
+        // Where the last profile stands now.
+        let text = text.replace("end_count = 47200", "end_count = 46800");
         text.replace("[part]\n", "[service]\nkeep_scans_gb = 0.2\n\n[part]\n")
     });
     drop(Store::open(&folder.join("store")).expect("a store"));
@@ -62,10 +65,12 @@ fn main() {
             _ => (&good, Status::Ok),
         };
         if shift > 0 {
-            for device in 0..3 {
-                played.unplug(device);
-                played.plug(made, device);
-            }
+            (0..3).for_each(|device| played.unplug(device));
+            running.until("gone", |snapshot| {
+                let mut devices = snapshot.devices.iter();
+                devices.all(|device| device.state == DeviceState::Failed)
+            });
+            (0..3).for_each(|device| played.plug(made, device));
         }
         let until_h = hours * f64::from(shift + 1) / f64::from(SHIFTS);
         day.shift(&running, &folder, until_h, expected);
@@ -231,7 +236,9 @@ fn ask_history(running: &Running, stored: i64) {
         ("trend of 500", &|| {
             drop(store.trend("e7.d1", 500, false).expect("a trend"))
         }),
-        ("usage", &|| drop(store.usage().expect("usage"))),
+        ("usage", &|| {
+            store.usage().expect("usage");
+        }),
     ];
     for (name, ask) in questions {
         let mut times: Vec<Duration> = (0..50)

@@ -109,8 +109,8 @@ impl Served {
             let text = fs::read_to_string(configs.join(file)).expect("the demo's files");
             // Fewer profiles than the demo takes: the page is tested here, not the measurement.
             let text = text
-                .replace("encoder_step = 200 ", "encoder_step = 500 ")
-                .replace("encoder_step = 200\n", "encoder_step = 500\n");
+                .replace("encoder_step = 200", "encoder_step = 400")
+                .replace("end_count = 47200", "end_count = 46800");
             fs::write(folder.join(file), text).expect("a copy of them");
         }
         let playing = devices.then(|| play(&folder));
