@@ -136,7 +136,7 @@ pub(super) enum Event {
     /// A job has ended; its result is committed.
     Concluded {
         job: i64,
-        result: Result<Inspection, String>,
+        result: Result<Box<Inspection>, String>,
     },
     /// The end.
     End,

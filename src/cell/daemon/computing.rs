@@ -45,6 +45,7 @@ pub(super) fn start_computing(
                             .to_owned(),
                     )
                 });
+                let result = result.map(Box::new);
                 let _ = events.send(Event::Concluded { job, result });
             }
         });

@@ -240,7 +240,7 @@ impl Running {
         self.look_at_disk();
     }
 
-    pub(super) fn concluded(&mut self, id: i64, result: Result<Inspection, String>) {
+    pub(super) fn concluded(&mut self, id: i64, result: Result<Box<Inspection>, String>) {
         self.computing.retain(|job| job.status.id != id);
         self.look_at_disk();
         match result {
@@ -252,7 +252,7 @@ impl Running {
                     reason = inspection.reason,
                     "inspected"
                 );
-                self.snapshot.last = Some(inspection);
+                self.snapshot.last = Some(*inspection);
             }
             Err(reason) => {
                 tracing::error!(inspection = id, reason, "no result");
