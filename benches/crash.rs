@@ -6,18 +6,21 @@
 
 #![allow(clippy::print_stdout)] // what a bench is for
 
+#[path = "cell/demo.rs"]
+mod demo;
+
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
-use acies::cell::{Daemon, DaemonOptions, Mode};
-use acies::config::Cell;
+use acies::cell::Mode;
 use acies::report::Report;
 use acies::store::{History, Order, Phase, ScanReader, Store};
-use acies_drivers::link::cable::Cable;
 use acies_simulators::demo_cell::{DemoCell, DemoOptions};
+
+use demo::Running;
 
 /// Where the daemon is told its folder.
 const FOLDER: &str = "ACIES_CRASH_FOLDER";
@@ -152,24 +155,12 @@ fn one(folder: &Path, after: Duration, seen: &mut Seen) {
 
 /// Inspects without pause until it is killed.
 fn daemon(folder: &Path) {
-    let ports = folder.join("dev");
-    std::fs::create_dir_all(&ports).expect("a folder");
-    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
-    for file in ["cell.toml", "recipe.toml", "part.step"] {
-        std::fs::copy(configs.join(file), folder.join(file)).expect("the demo's file");
-    }
+    demo::files_in(folder, |text| text);
     let _playing = DemoCell::with_options(DemoOptions::new(1))
-        .start(&ports)
+        .start(&folder.join("dev"))
         .expect("the devices");
-    let cell = Cell::read(&folder.join("cell.toml")).expect("the cell");
-    let store = Store::open(&folder.join("store")).expect("the store");
-    let options = DaemonOptions {
-        simulated: true,
-        ..DaemonOptions::default()
-    };
-    let daemon =
-        Daemon::start(Arc::new(cell), Arc::new(store), Arc::new(Cable), options).expect("a daemon");
-    let handle = daemon.handle();
+    let running = Running::start(folder);
+    let handle = &running.handle;
     let runtime = tokio::runtime::Builder::new_current_thread()
         .enable_all()
         .build()

@@ -6,21 +6,24 @@
 
 #![allow(clippy::print_stdout)] // what a bench is for
 
-use std::net::{SocketAddr, TcpListener};
+#[path = "cell/demo.rs"]
+mod demo;
+#[path = "cell/sockets.rs"]
+mod sockets;
+
+use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
-use acies::cell::{self, Daemon, DaemonOptions, Handle, Mode, Snapshot, State};
+use acies::cell::{self, Handle};
 use acies::config::{Cell, Service};
-use acies::store::{Order, Store};
 use acies::web;
 use acies_drivers::link::cable::Cable;
 use acies_simulators::demo_cell::{DemoCell, DemoOptions};
-use acies_simulators::grbl::SimulatedProbe;
-use acies_simulators::open_profile::SimulatedProfiler;
-use acies_simulators::wire::Wire;
+
+use demo::{Running, acquiring};
+use sockets::Devices;
 
 /// Points of a profile.
 const COLUMNS: u32 = 3200;
@@ -28,58 +31,37 @@ const COLUMNS: u32 = 3200;
 const STEP: &str = "62";
 /// Profiles a second: the 760 of a scan take 10 s.
 const RATE: &str = "76.0";
-/// Longer than anything here may take.
-const LONG: Duration = Duration::from_secs(120);
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let rounds = arguments.iter().find_map(|a| a.parse().ok()).unwrap_or(50);
-    let folder = std::env::temp_dir().join(format!("acies-latency-{}", std::process::id()));
-    let _ = std::fs::remove_dir_all(&folder);
     let stages = arguments.iter().any(|a| a == "stages");
-    let (playing, cell) = set_up(&folder, !stages);
+    let (playing, folder) = set_up(!stages);
     if stages {
+        let cell = Cell::read(&folder.join("cell.toml")).expect("the cell");
         by_stage(&cell);
     } else {
         let page = arguments.iter().any(|a| a == "page");
-        in_the_daemon(cell, &folder, rounds, page);
+        in_the_daemon(&folder, rounds, page);
     }
     drop(playing);
     let _ = std::fs::remove_dir_all(&folder);
 }
 
 /// The demo's cell with finer profiles.
-fn set_up(folder: &Path, paced: bool) -> (([SimulatedProfiler; 2], SimulatedProbe), Cell) {
-    std::fs::create_dir_all(folder.join("dev")).expect("a folder");
-    let configs = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo");
-    for file in ["recipe.toml", "part.step"] {
-        std::fs::copy(configs.join(file), folder.join(file)).expect("the demo's file");
-    }
-    let text = std::fs::read_to_string(configs.join("cell.toml")).expect("the demo's cell");
-    let finer = format!("encoder_step = {STEP}\ncolumns = {COLUMNS}\nrate_hz = {RATE}");
-    let mut text = text.replace("encoder_step = 200", &finer);
-    let path: PathBuf = folder.join("cell.toml");
-    let mut demo = DemoCell::with_options(DemoOptions {
+fn set_up(paced: bool) -> (Devices, PathBuf) {
+    let folder = demo::files("latency", |text| {
+        let finer = format!("encoder_step = {STEP}\ncolumns = {COLUMNS}\nrate_hz = {RATE}");
+        text.replace("encoder_step = 200", &finer)
+    });
+    let mut cell = DemoCell::with_options(DemoOptions {
         paced,
         ..DemoOptions::new(1)
     });
-    for sensor in &mut demo.sensors {
+    for sensor in &mut cell.sensors {
         sensor.view.columns = COLUMNS;
     }
-    // Twenty megabytes in ten seconds are more than serial lines are made for.
-    let mut profiler = |which: usize, port: &str| {
-        let wire = Wire::tcp(SocketAddr::from(([127, 0, 0, 1], 0))).expect("a port");
-        let address = format!("address = {:?}", wire.name());
-        text = text.replace(&format!("port = \"./dev/{port}\""), &address);
-        demo.start_profiler(which, wire).expect("a profiler")
-    };
-    let profilers = [profiler(0, "ttyLEFT"), profiler(1, "ttyRIGHT")];
-    let wire = Wire::pty(&folder.join("dev/ttyPROBE")).expect("a pseudo-terminal");
-    // Touches in real time would only lengthen what comes before the scan.
-    demo.options.paced = false;
-    let probe = demo.start_probe(wire).expect("a probe");
-    std::fs::write(&path, text).expect("the cell's file");
-    ((profilers, probe), Cell::read(&path).expect("the cell"))
+    (sockets::play(cell, &folder), folder)
 }
 
 fn by_stage(cell: &Cell) {
@@ -141,48 +123,20 @@ fn opened(handle: Handle, service: Service, folder: &Path) -> Browsers {
     Browsers((0..2).map(browser).collect())
 }
 
-fn in_the_daemon(cell: Cell, folder: &Path, rounds: usize, page: bool) {
-    let service = cell.service.clone();
-    let store = Arc::new(Store::open(&folder.join("store")).expect("the store"));
-    let options = DaemonOptions {
-        simulated: true,
-        ..DaemonOptions::default()
-    };
-    let daemon = Daemon::start(Arc::new(cell), store, Arc::new(Cable), options).expect("a daemon");
-    let handle = daemon.handle();
-    let _browsers = page.then(|| opened(daemon.handle(), service, folder));
-    let runtime = tokio::runtime::Builder::new_current_thread()
-        .enable_all()
-        .build()
-        .expect("a runtime");
-    let until = |what: &str, is_so: &dyn Fn(&Snapshot) -> bool| {
-        let mut follow = handle.follow();
-        let waited = runtime.block_on(async {
-            tokio::time::timeout(LONG, follow.wait_for(|s| is_so(s)))
-                .await
-                .map(|found| found.map(|_| ()))
-        });
-        assert!(waited.is_ok(), "{what}: {:#?}", handle.snapshot());
-    };
+fn in_the_daemon(folder: &Path, rounds: usize, page: bool) {
+    let running = Running::start(folder);
+    let cell = Cell::read(&folder.join("cell.toml")).expect("the cell");
+    let handle = running.handle.clone();
+    let _browsers = page.then(|| opened(handle.clone(), cell.service, folder));
     let mut seconds: Vec<f64> = Vec::new();
     for round in 0..rounds {
-        until("ready", &|s| s.state == State::Ready);
-        let order = Order {
-            part_serial: format!("part {round}"),
-            ..Order::default()
-        };
-        let started = runtime.block_on(handle.start(order, "bench", None, Mode::Single));
-        let id = started.expect("a start").0.id;
-        let at_work = |s: &Snapshot| {
-            let jobs = s.acquiring.iter().chain(&s.queue);
-            jobs.into_iter().any(|job| job.id == id)
-        };
+        let id = running.start_part(&format!("part {round}"));
         let (began, busy) = (Instant::now(), processor_seconds());
-        until("acquired", &|s| !at_work(s));
+        running.until("acquired", |s| !acquiring(s, id));
         let acquired = Instant::now();
         let scan = (acquired - began).as_secs_f64();
         let busy = processor_seconds() - busy;
-        until("concluded", &|s| {
+        running.until("concluded", |s| {
             s.last.as_ref().is_some_and(|last| last.id == id)
         });
         let latency = acquired.elapsed().as_secs_f64();

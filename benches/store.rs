@@ -1,9 +1,9 @@
 //! `cargo bench --bench store [-- INSPECTIONS]`: how long questions to the history take when a million inspections are stored.
-//!
-//! The rows are written as the store writes them, twenty characteristics each, in large transactions and not one by one: making
-//! a million durable commits would take hours and tell nothing about questions.
 
 #![allow(clippy::print_stdout)] // what a bench is for
+
+#[path = "cell/history.rs"]
+mod history;
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -18,7 +18,7 @@ fn main() {
     let folder = std::env::temp_dir().join(format!("acies-history-{}", std::process::id()));
     let _ = std::fs::remove_dir_all(&folder);
     let store = Store::open(&folder).expect("a store");
-    fill(&folder.join("acies.db"), count);
+    history::fill(&folder.join("acies.db"), count, true);
     let size = std::fs::metadata(folder.join("acies.db")).map_or(0, |m| m.len());
     println!(
         "{count} inspections, {} MB, {:.0} bytes each",
@@ -152,56 +152,4 @@ fn main() {
     };
     store.audit(&entry, SystemTime::now()).expect("written");
     let _ = std::fs::remove_dir_all(&folder);
-}
-
-fn fill(path: &std::path::Path, count: i64) {
-    let mut database = rusqlite::Connection::open(path).expect("the database");
-    database
-        .execute_batch("PRAGMA synchronous = OFF; PRAGMA cache_size = -400000;")
-        .expect("settings");
-    let transaction = database.transaction().expect("a transaction");
-    {
-        for number in 1..=20 {
-            let name = format!("e{number}.d1");
-            transaction
-                .execute(
-                    "INSERT INTO characteristics (id, name, unit) VALUES (?1, ?2, 'mm')",
-                    (number, name),
-                )
-                .expect("a name");
-        }
-        let mut inspection = transaction
-            .prepare(
-                "INSERT INTO inspections (phase, part_serial, order_number, purpose, operator, requested_ms, started_ms, acquired_ms,
-                 ended_ms, verdict, reason, points, scan_seconds, verdict_seconds, scan_file, scan_bytes, scan_whole)
-                 VALUES ('done', ?1, ?2, 'series', 'anna', ?3, ?3, ?3, ?3, ?4, 'all values lie within their limits', 2000000, 10.0, 0.5, ?5, 20000000, 1)",
-            )
-            .expect("a statement");
-        let mut measured = transaction
-            .prepare("INSERT INTO measured VALUES (?1, ?2, ?3, 0.001, -0.05, 0.05, 'ok')")
-            .expect("a statement");
-        for id in 1..=count {
-            let verdict = match id % 20 {
-                0 => "not_ok",
-                1 => "not_decidable",
-                _ => "ok",
-            };
-            let order = format!("O-{}", id / 500);
-            inspection
-                .execute((
-                    format!("P-{id}"),
-                    order,
-                    1_700_000_000_000 + id * 30_000,
-                    verdict,
-                    format!("{id:08}.raw"),
-                ))
-                .expect("a row");
-            for characteristic in 1..=20 {
-                measured
-                    .execute((characteristic, id, (id % 97) as f64 * 1e-3))
-                    .expect("a value");
-            }
-        }
-    }
-    transaction.commit().expect("committed");
 }

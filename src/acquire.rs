@@ -20,7 +20,9 @@ use crate::geometry::RigidTransform;
 use crate::points::PointCloud;
 
 pub use assembler::Assembler;
-pub use carried::{CarriedRun, Carrier, CarrierPlan, run_carried, scan_carried};
+pub use carried::{
+    CarriedRecord, CarriedRun, CarriedView, Carrier, CarrierPlan, run_carried, scan_carried,
+};
 pub(crate) use run::chain;
 pub use run::{Profiling, ScanError, ScanEvent, ScanPlan, ScanWatch, scan};
 

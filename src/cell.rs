@@ -6,6 +6,7 @@
 mod acquisition;
 mod daemon;
 mod devices;
+mod feed;
 mod job;
 mod live;
 mod meanwhile;
@@ -24,6 +25,7 @@ use crate::store::StoreError;
 pub use daemon::{Command, Daemon, DaemonOptions, Handle, Refusal, Started};
 pub use job::{Outcome, Part, Step, check_recipe, read_part, read_recipe, report_of, run};
 pub use live::{Live, LiveEdges, LivePoints, LiveProfile};
+pub use recipes::judge_alike;
 pub use state::{Mode, State};
 pub use status::{DeviceState, DeviceStatus, JobStatus, Snapshot};
 

@@ -4,6 +4,7 @@
 //! only on purpose. Inside the kernel angles are radians; here they are degrees. A number that is not finite never leaves:
 //! it becomes `null`, with the reason beside it.
 
+mod because;
 mod build;
 mod characteristic;
 mod conclusion;

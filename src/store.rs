@@ -28,7 +28,7 @@ pub use inspections::{
 };
 pub use people::{Person, Role, Session, SessionKind};
 pub use recipes::{NewRecipe, RecipeContent, RecipeVersion};
-pub use scan_file::{ScanFileError, ScanReader, ScanWriter, StoredView};
+pub use scan_file::{ScanFileError, ScanReader, ScanWriter, StoredCarrier, StoredView};
 pub use upkeep::{Retention, Swept, Usage, restore};
 
 /// How long one connection waits for another before it gives up.
@@ -70,6 +70,12 @@ pub enum StoreError {
     /// What was asked for is not there.
     #[error("{what}: there is none; it may have been removed by the retention rule")]
     Missing {
+        /// What was asked for.
+        what: String,
+    },
+    /// What is there cannot be read.
+    #[error("{what}: damaged; restore it from a backup")]
+    Damaged {
         /// What was asked for.
         what: String,
     },

@@ -1,18 +1,22 @@
 //! Scans by a robot: what its poses make of the profiles, against scenes known exactly, and every pose that is missing accounted for.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use acies::acquire::lag::{Artefact, Lag, find_lag};
 use acies::acquire::{
-    Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, run_carried, scan_carried,
+    Calibration, Carrier, CarrierPlan, Profiling, Scan, ScanEvent, ScanWatch, run_carried,
+    scan_carried,
 };
 use acies::cell::{Daemon, DaemonOptions, Mode, Snapshot, State};
 use acies::config::Cell;
 use acies::geometry::RigidTransform;
+use acies::points::PointCloud;
 use acies::report::Report;
 use acies::report::wire::Status;
-use acies::store::{Order, Phase, Store};
+use acies::store::{
+    Order, Phase, ScanFileError, ScanReader, ScanWriter, Store, StoredCarrier, StoredView, Trigger,
+};
 use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot};
 use acies_drivers::error::DeviceError;
@@ -218,6 +222,15 @@ fn plan() -> CarrierPlan {
 }
 
 fn scripted(robot: Clock, sensor: Clock, skip: std::ops::Range<usize>) -> Scan {
+    watched(robot, sensor, skip, &mut |_: ScanEvent| {})
+}
+
+fn watched(
+    robot: Clock,
+    sensor: Clock,
+    skip: std::ops::Range<usize>,
+    watch: &mut dyn ScanWatch,
+) -> Scan {
     let began = Instant::now();
     let lost = skip.len() as u64;
     let calibration = Calibration {
@@ -234,7 +247,7 @@ fn scripted(robot: Clock, sensor: Clock, skip: std::ops::Range<usize>) -> Scan {
         robot: Box::new(Scripted::new(poses(robot, began, skip), lost)),
         plan: plan(),
     };
-    let (scan, _) = scan_carried(profilers, &mut carrier, &mut |_: ScanEvent| {}).expect("a scan");
+    let (scan, _) = scan_carried(profilers, &mut carrier, watch).expect("a scan");
     scan
 }
 
@@ -297,6 +310,93 @@ fn a_clock_that_is_none_places_nothing() {
         scan.views[0].findings,
         ["line: 200 profiles without a usable time were left out; check that line's clock is on"]
     );
+}
+
+/// Writes a run into its file.
+struct Writing(ScanWriter);
+
+impl ScanWatch for Writing {
+    fn event(&mut self, _: ScanEvent) {}
+
+    fn profile(&mut self, view: usize, profile: &Profile, _: &[DVec3]) {
+        self.0.push(view, profile).expect("written");
+    }
+
+    fn pose(&mut self, pose: &Pose) {
+        self.0.push_pose(pose).expect("written");
+    }
+}
+
+#[test]
+fn the_points_of_a_run_by_a_robot_come_back_from_its_file_to_the_bit() {
+    let folder = std::env::temp_dir().join(format!("acies-poses-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    let store = Store::open(&folder).expect("a store");
+    let order = Order::default();
+    let trigger = Trigger {
+        order: &order,
+        operator: "anna",
+        key: None,
+        simulated: true,
+    };
+    let now = SystemTime::now();
+    let (inspection, _) = store.queue(&trigger, now).expect("queued");
+    let begun = store.begin(inspection.id, None, "1.raw", now);
+    begun.expect("begun");
+    let path = folder.join("scans/1.raw");
+    let plan = plan();
+    let view = StoredView {
+        device: "line".into(),
+        identity: identity(),
+        calibration: Calibration {
+            machine_from_sensor: tool_from_sensor(),
+            travel_mm_per_count: DVec3::ZERO,
+        },
+        carried: true,
+        carrier: Some(StoredCarrier {
+            machine_from_base: plan.machine_from_base,
+            lag_s: plan.lag_s,
+        }),
+    };
+    let writer = ScanWriter::create(&path, std::slice::from_ref(&view)).expect("a file");
+    let mut watch = Writing(writer);
+    let scan = watched(ROBOT, SENSOR, 200..225, &mut watch);
+    watch.0.finish(true).expect("finished");
+    let bits = |cloud: &PointCloud| {
+        let numbers = cloud.positions.iter().flat_map(|p| p.to_array());
+        numbers.map(f64::to_bits).collect::<Vec<_>>()
+    };
+    let read = || {
+        let reader = ScanReader::open(&path).expect("a reader");
+        assert_eq!(reader.views(), std::slice::from_ref(&view));
+        reader.into_cloud().expect("points")
+    };
+    let again = read();
+    assert!(scan.cloud.positions.len() > 180 * 41);
+    assert_eq!(bits(&again), bits(&scan.cloud));
+    assert_eq!(
+        (&again.origins, &again.views),
+        (&scan.cloud.origins, &scan.cloud.views)
+    );
+    // A daemon that ended before it noted the file writes it anew.
+    let mended = store.recover("the daemon ended", now).expect("mended");
+    assert_eq!(mended[0].scan_whole, Some(true));
+    assert_eq!(bits(&read()), bits(&scan.cloud));
+
+    // A file of before has no poses, and says so.
+    let old = StoredView {
+        carrier: None,
+        ..view
+    };
+    let path = folder.join("old.raw");
+    let mut writer = ScanWriter::create(&path, &[old]).expect("a file");
+    let profile = &profiles(SENSOR, Instant::now())[0];
+    writer.push(0, profile).expect("written");
+    writer.finish(true).expect("finished");
+    let reader = ScanReader::open(&path).expect("a reader");
+    let error = reader.into_cloud().expect_err("no poses");
+    assert!(matches!(error, ScanFileError::Carried { .. }), "{error}");
+    let _ = std::fs::remove_dir_all(&folder);
 }
 
 // ---- Simulated devices over the network -------------------------------------------------------------------------------
@@ -833,6 +933,10 @@ fn a_part_under_a_robot_is_inspected_from_touch_to_verdict() {
         .inspection(asked.id)
         .expect("it is in the history");
     assert_eq!(ended.phase, Phase::Done, "{}", ended.reason);
+    let raw = handle.store().scan_path(asked.id).expect("raw data");
+    let reader = ScanReader::open(&raw).expect("a reader");
+    let cloud = reader.into_cloud().expect("points");
+    assert_eq!(ended.points, Some(cloud.positions.len() as i64));
     let report: Report =
         serde_json::from_str(&handle.store().report_json(asked.id).expect("a report"))
             .expect("JSON");

@@ -1,5 +1,11 @@
 //! The program as people use it: the demo end to end, its files taken up by the other commands, exit statuses and errors.
 
+#[path = "report/part.rs"]
+#[allow(dead_code)] // what the report's tests need beside it
+mod part;
+#[path = "program/store.rs"]
+mod store;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -111,6 +111,7 @@ fn views() -> Vec<StoredView> {
             travel_mm_per_count: DVec3::new(0.0, 0.01, 1.0 / 3.0),
         },
         carried: false,
+        carrier: None,
     };
     vec![view("left"), view("right")]
 }

@@ -10,5 +10,9 @@ mod bench;
 mod browser;
 #[path = "web/document.rs"]
 mod document;
+#[path = "web/firefox.rs"]
+mod firefox;
+#[path = "../benches/cell/sockets.rs"]
+mod sockets;
 #[path = "web/wire.rs"]
 mod wire;

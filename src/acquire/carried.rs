@@ -17,7 +17,7 @@ use acies_drivers::device::{Losses, Robot};
 use acies_drivers::error::DeviceError;
 use glam::{DQuat, DVec3};
 
-use super::clock::{ClockFit, fit_clock};
+use super::clock::fit_clock;
 use super::lag::Pass;
 use super::poses::{PoseGap, PoseTrack};
 use super::run::{Message, POLL, append, chain, deliver_all, start_all};
@@ -95,7 +95,30 @@ pub fn scan_carried(
 pub struct CarriedRun {
     took: Vec<Took>,
     poses: Poses,
-    began: Instant,
+}
+
+/// What was recorded of a run by a robot: enough to place its profiles, when it is over or a year later, to the same bits.
+#[derive(Debug, Clone)]
+pub struct CarriedRecord<'a> {
+    /// The profilers.
+    pub views: Vec<CarriedView<'a>>,
+    /// The robot's poses, as they came.
+    pub poses: &'a [Pose],
+    /// Where the robot's base stood.
+    pub machine_from_base: RigidTransform,
+    /// As [`CarrierPlan::lag_s`].
+    pub lag_s: f64,
+}
+
+/// One profiler of a [`CarriedRecord`].
+#[derive(Debug, Clone, Copy)]
+pub struct CarriedView<'a> {
+    /// The device's name in the cell's configuration.
+    pub device: &'a str,
+    /// Where it was on the tool.
+    pub tool_from_sensor: RigidTransform,
+    /// What it took, in order.
+    pub profiles: &'a [Profile],
 }
 
 /// Runs once as [`scan_carried`] does, and places nothing.
@@ -118,31 +141,36 @@ pub fn run_carried(
         let _ = carrier.robot.stop();
         return Err(error);
     }
-    let began = Instant::now();
     let done: Vec<AtomicBool> = profilers.iter().map(|_| AtomicBool::new(false)).collect();
     let over = AtomicBool::new(false);
-    let (shares, share) = channel();
+    let (sender, moves) = channel();
     let plan = carrier.plan;
     let (took, poses) = thread::scope(|scope| {
         let receiver = deliver_all(scope, profilers, plan.silence, &done);
         let (robot, done, over_now) = (carrier.robot.as_mut(), &done, &over);
-        let follower = scope.spawn(move || follow(robot, plan, &shares, done, over_now));
-        let took = collect(&receiver, &share, done, watch);
+        let follower = scope.spawn(move || follow(robot, plan, &sender, done, over_now));
+        let (took, told) = collect(&receiver, &moves, done, watch);
         over.store(true, Ordering::Release);
         // A panic there has said so already; the scan then has no poses, and says that.
-        (took, follower.join().unwrap_or_default())
+        let poses = follower.join().unwrap_or_default();
+        poses
+            .poses
+            .iter()
+            .skip(told)
+            .for_each(|pose| watch.pose(pose));
+        (took, poses)
     });
     for (profiling, took) in profilers.iter().zip(&took) {
         lost(&profiling.name, took.error.as_ref(), watch);
     }
     lost(&carrier.name, poses.error.as_ref(), watch);
-    Ok(CarriedRun { took, poses, began })
+    Ok(CarriedRun { took, poses })
 }
 
 impl CarriedRun {
     /// Why the run is no whole one, in words; nothing where it is.
     pub fn broken(&self, profilers: &[Profiling], carrier: &Carrier) -> Option<String> {
-        let (track, _) = self.track(carrier);
+        let track = track_of(&self.poses.poses, carrier.plan.machine_from_base);
         let of_profilers = profilers.iter().zip(&self.took).find_map(|(p, took)| {
             let error = took.error.as_ref().map(|error| chain(error));
             let silent = took.fell_silent.then(|| "it fell silent".to_owned());
@@ -155,38 +183,34 @@ impl CarriedRun {
         })
     }
 
-    /// The poses of the tool in the machine, by the robot's clock, and that clock.
-    fn track(&self, carrier: &Carrier) -> (PoseTrack, Option<ClockFit>) {
-        let poses = &self.poses.poses;
-        let received = poses.iter().map(|p| (p.device_time_s, p.host_time));
-        let clock = fit_clock(&receipts(received, self.began));
-        let mut track = PoseTrack::default();
-        for pose in poses {
-            let turn = DQuat::from_scaled_axis(pose.rotation.into());
-            let base_from_tool = RigidTransform::new(turn, pose.position_mm.into());
-            track.push(
-                pose.device_time_s,
-                carrier.plan.machine_from_base * base_from_tool,
-            );
+    fn record<'a>(&'a self, profilers: &'a [Profiling], plan: &CarrierPlan) -> CarriedRecord<'a> {
+        let views = profilers.iter().zip(&self.took);
+        let views = views.map(|(profiling, took)| CarriedView {
+            device: &profiling.name,
+            tool_from_sensor: profiling.calibration.machine_from_sensor,
+            profiles: &took.profiles,
+        });
+        CarriedRecord {
+            views: views.collect(),
+            poses: &self.poses.poses,
+            machine_from_base: plan.machine_from_base,
+            lag_s: plan.lag_s,
         }
-        (track, clock)
-    }
-
-    /// Times of a view's profiles by the robot's clock, no lag added; `None` where a clock is none.
-    fn times(&self, view: usize, robot_clock: Option<ClockFit>) -> Option<Vec<f64>> {
-        let profiles = &self.took[view].profiles;
-        let time_s = |profile: &Profile| profile.device_time_ns as f64 * 1e-9;
-        let received = profiles.iter().map(|p| (time_s(p), p.host_time));
-        let clock = fit_clock(&receipts(received, self.began))?;
-        let robot_clock = robot_clock?;
-        let times = profiles.iter().map(time_s);
-        Some(times.map(|t| robot_clock.device(clock.host(t))).collect())
     }
 
     /// What the profiler `view` saw, in the tool by the robot's clock, to find the lag with. `None` where a clock is none.
     pub fn pass(&self, view: usize, profiling: &Profiling, carrier: &Carrier) -> Option<Pass> {
-        let (track, clock) = self.track(carrier);
-        let times = self.times(view, clock)?;
+        let record = CarriedRecord {
+            // The others tell nothing of this one's clock.
+            views: vec![CarriedView {
+                device: &profiling.name,
+                tool_from_sensor: profiling.calibration.machine_from_sensor,
+                profiles: &self.took[view].profiles,
+            }],
+            ..self.record(&[], &carrier.plan)
+        };
+        let track = track_of(record.poses, record.machine_from_base);
+        let times = record.times().pop()??;
         let tool_from_sensor = profiling.calibration.machine_from_sensor;
         let profiles = self.took[view].profiles.iter().zip(times);
         let seen = profiles.map(|(profile, time_s)| {
@@ -215,7 +239,7 @@ fn lost(device: &str, error: Option<&DeviceError>, watch: &mut dyn ScanWatch) {
 fn follow(
     robot: &mut dyn Robot,
     plan: CarrierPlan,
-    shares: &Sender<f64>,
+    moves: &Sender<(Pose, f64)>,
     done: &[AtomicBool],
     over: &AtomicBool,
 ) -> Poses {
@@ -250,14 +274,16 @@ fn follow(
                 }
                 let from_end = stands.distance(plan.end_mm);
                 farthest_mm = farthest_mm.max(from_end);
+                let mut share = 0.0;
                 if farthest_mm > plan.within_mm {
-                    // The watcher may have gone; that ends no scan.
-                    let _ = shares.send(1.0 - from_end / farthest_mm);
+                    share = 1.0 - from_end / farthest_mm;
                     if from_end <= plan.within_mm && !brought.reached {
                         brought.reached = true;
                         finish();
                     }
                 }
+                // The watcher may have gone; that ends no scan.
+                let _ = moves.send((pose, share));
                 brought.poses.push(pose);
             }
             Ok(None) if moved.elapsed() > plan.silence => finish(),
@@ -278,22 +304,27 @@ fn follow(
     brought
 }
 
+/// What came of the profilers, and how many poses the watcher was told of.
 fn collect(
     receiver: &Receiver<Message>,
-    shares: &Receiver<f64>,
+    moves: &Receiver<(Pose, f64)>,
     done: &[AtomicBool],
     watch: &mut dyn ScanWatch,
-) -> Vec<Took> {
+) -> (Vec<Took>, usize) {
     let mut took: Vec<Took> = done.iter().map(|_| Took::default()).collect();
-    let (mut profiles, mut share) = (0, 0.0);
+    let (mut profiles, mut share, mut told) = (0, 0.0, 0);
     loop {
-        match receiver.recv_timeout(POLL) {
+        let message = receiver.recv_timeout(POLL);
+        for (pose, now) in moves.try_iter() {
+            watch.pose(&pose);
+            (share, told) = (now, told + 1);
+        }
+        match message {
             Ok(Message::Profile(view, profile)) => {
                 // Where it lies is known when the run is over.
                 watch.profile(view, &profile, &[]);
                 took[view].profiles.push(*profile);
                 profiles += 1;
-                share = shares.try_iter().last().unwrap_or(share);
                 watch.event(ScanEvent::Progress { profiles, share });
             }
             Ok(Message::Ended {
@@ -313,7 +344,7 @@ fn collect(
                 .for_each(|view| view.store(true, Ordering::Release));
         }
     }
-    took
+    (took, told)
 }
 
 // ---- Placing ----------------------------------------------------------------------------------------------------------
@@ -358,24 +389,78 @@ impl Unplaced {
     }
 }
 
-fn place(profilers: &[Profiling], run: CarriedRun, carrier: &Carrier) -> Scan {
-    let (track, robot_clock) = run.track(carrier);
-    let times: Vec<Option<Vec<f64>>> = (0..profilers.len())
-        .map(|view| run.times(view, robot_clock))
-        .collect();
-    let poses = &run.poses;
-    let of_robot = robot_findings(carrier, poses, &track);
-    let sound = poses.reached && poses.error.is_none();
-    let mut cloud = PointCloud {
+impl CarriedRecord<'_> {
+    /// The points of all views in the machine frame.
+    pub fn cloud(&self) -> PointCloud {
+        let mut cloud = empty_cloud();
+        for (index, placed) in self.place().1.into_iter().enumerate() {
+            append(&mut cloud, placed.cloud, index as u16);
+        }
+        cloud
+    }
+
+    fn place(&self) -> (PoseTrack, Vec<PlacedView>) {
+        let track = track_of(self.poses, self.machine_from_base);
+        let views = self.views.iter().zip(self.times());
+        let placed = views.map(|(view, times)| {
+            let times = times.map(|times| times.iter().map(|t| t + self.lag_s).collect());
+            place_view(view, times, &track)
+        });
+        let placed = placed.collect();
+        (track, placed)
+    }
+
+    /// Times of the profiles of every view by the robot's clock, no lag added; `None` where a clock is none.
+    fn times(&self) -> Vec<Option<Vec<f64>>> {
+        let received = self.poses.iter().map(|pose| pose.host_time);
+        let profiles = self.views.iter().flat_map(|view| view.profiles);
+        let received = received.chain(profiles.map(|profile| profile.host_time));
+        // Any moment would do; this one is told by the record itself.
+        let Some(began) = received.min() else {
+            return self.views.iter().map(|_| None).collect();
+        };
+        let poses = self.poses.iter().map(|p| (p.device_time_s, p.host_time));
+        let robot_clock = fit_clock(&receipts(poses, began));
+        let time_s = |profile: &Profile| profile.device_time_ns as f64 * 1e-9;
+        let times = self.views.iter().map(|view| {
+            let received = view.profiles.iter().map(|p| (time_s(p), p.host_time));
+            let clock = fit_clock(&receipts(received, began))?;
+            let robot_clock = robot_clock?;
+            let times = view.profiles.iter().map(time_s);
+            Some(times.map(|t| robot_clock.device(clock.host(t))).collect())
+        });
+        times.collect()
+    }
+}
+
+/// The poses of the tool in the machine, by the robot's clock.
+fn track_of(poses: &[Pose], machine_from_base: RigidTransform) -> PoseTrack {
+    let mut track = PoseTrack::default();
+    for pose in poses {
+        let turn = DQuat::from_scaled_axis(pose.rotation.into());
+        let base_from_tool = RigidTransform::new(turn, pose.position_mm.into());
+        track.push(pose.device_time_s, machine_from_base * base_from_tool);
+    }
+    track
+}
+
+fn empty_cloud() -> PointCloud {
+    PointCloud {
         frame: Frame::Machine,
         positions: Vec::new(),
         origins: Vec::new(),
         views: Vec::new(),
-    };
+    }
+}
+
+fn place(profilers: &[Profiling], run: CarriedRun, carrier: &Carrier) -> Scan {
+    let (track, placed) = run.record(profilers, &carrier.plan).place();
+    let poses = &run.poses;
+    let of_robot = robot_findings(carrier, poses, &track);
+    let sound = poses.reached && poses.error.is_none();
+    let mut cloud = empty_cloud();
     let mut views = Vec::new();
-    for ((profiling, took), times) in profilers.iter().zip(run.took).zip(times) {
-        let times = times.map(|times| times.iter().map(|t| t + carrier.plan.lag_s).collect());
-        let placed = place_view(profiling, &took.profiles, times, &track);
+    for ((profiling, took), placed) in profilers.iter().zip(&run.took).zip(placed) {
         let mut findings = if views.is_empty() {
             of_robot.clone()
         } else {
@@ -455,30 +540,19 @@ struct PlacedView {
     profiles: u64,
 }
 
-fn place_view(
-    profiling: &Profiling,
-    profiles: &[Profile],
-    times_s: Option<Vec<f64>>,
-    track: &PoseTrack,
-) -> PlacedView {
-    let tool_from_sensor = profiling.calibration.machine_from_sensor;
+fn place_view(view: &CarriedView<'_>, times_s: Option<Vec<f64>>, track: &PoseTrack) -> PlacedView {
     let mut placed = PlacedView {
-        cloud: PointCloud {
-            frame: Frame::Machine,
-            positions: Vec::new(),
-            origins: Vec::new(),
-            views: Vec::new(),
-        },
+        cloud: empty_cloud(),
         unplaced: Unplaced::default(),
         empty_columns: 0,
         profiles: 0,
     };
     let mut towards_sensor = DVec3::ZERO;
     if let Some(times) = times_s {
-        for (profile, pose) in profiles.iter().zip(track.at(&times)) {
+        for (profile, pose) in view.profiles.iter().zip(track.at(&times)) {
             match pose {
                 Ok(machine_from_tool) => {
-                    let machine_from_sensor = machine_from_tool * tool_from_sensor;
+                    let machine_from_sensor = machine_from_tool * view.tool_from_sensor;
                     towards_sensor += machine_from_sensor.vector(DVec3::NEG_Z);
                     placed.add(profile, machine_from_sensor);
                 }
@@ -487,10 +561,10 @@ fn place_view(
             }
         }
     } else {
-        placed.unplaced.no_clock = profiles.len() as u64;
+        placed.unplaced.no_clock = view.profiles.len() as u64;
     }
     placed.cloud.views.push(View {
-        device: profiling.name.clone(),
+        device: view.device.to_owned(),
         // The mean over the run: a robot that turns by less than a right angle leaves it on the sensor's side.
         towards_sensor: towards_sensor.try_normalize().unwrap_or(DVec3::Z),
     });

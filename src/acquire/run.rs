@@ -5,7 +5,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::thread::{self, Scope};
 use std::time::{Duration, Instant};
 
-use acies_drivers::capture::Profile;
+use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::{Losses, Profiler};
 use acies_drivers::error::DeviceError;
 use glam::DVec3;
@@ -66,6 +66,11 @@ pub trait ScanWatch {
     /// A profile of the view `view` came, and these points were made of it (machine, mm): none where it could not be placed.
     fn profile(&mut self, view: usize, profile: &Profile, points: &[DVec3]) {
         let _ = (view, profile, points);
+    }
+
+    /// A pose of the robot that carries the profilers came; a little later than the profiles around it.
+    fn pose(&mut self, pose: &Pose) {
+        let _ = pose;
     }
 
     /// Whether the scan should be given up; asked after every profile and 20 times a second.

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
 
-use acies_drivers::capture::Profile;
+use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::Instrument;
 use glam::DVec3;
 
@@ -22,7 +22,7 @@ use super::live::Live;
 use super::meanwhile::Show;
 use crate::acquire::{Profiling, ScanEvent, ScanWatch};
 use crate::config::Cell;
-use crate::store::{ScanWriter, StoredView};
+use crate::store::{ScanFileError, ScanWriter, StoredCarrier, StoredView};
 
 /// How often progress is told.
 const TELL_EVERY: Duration = Duration::from_millis(100);
@@ -76,6 +76,11 @@ type Writer = Option<Result<ScanWriter, String>>;
 
 fn work(acquisition: &Acquisition, writer: &mut Writer) -> Result<Acquired, CellError> {
     let mut instruments = borrow(acquisition)?;
+    let plan = acquisition.cell.carrier.as_ref().map(|config| config.plan);
+    let carrier = plan.map(|plan| StoredCarrier {
+        machine_from_base: plan.machine_from_base,
+        lag_s: plan.lag_s,
+    });
     let views: Vec<StoredView> = instruments
         .profilers
         .iter()
@@ -83,7 +88,8 @@ fn work(acquisition: &Acquisition, writer: &mut Writer) -> Result<Acquired, Cell
             device: profiling.name.clone(),
             identity: profiling.profiler.identity().clone(),
             calibration: profiling.calibration,
-            carried: acquisition.cell.carrier.is_some(),
+            carried: carrier.is_some(),
+            carrier,
         })
         .collect();
     let names: Vec<String> = views.iter().map(|view| view.device.clone()).collect();
@@ -199,6 +205,17 @@ struct Follower<'a> {
     lost: Vec<(String, String)>,
 }
 
+impl Follower<'_> {
+    /// Writes into the raw data's file, as long as that can be written.
+    fn keep(&mut self, write: impl FnOnce(&mut ScanWriter) -> Result<(), ScanFileError>) {
+        if let Some(Ok(writer)) = self.writer
+            && let Err(error) = write(writer)
+        {
+            *self.writer = Some(Err(chain(&error)));
+        }
+    }
+}
+
 impl ScanWatch for Follower<'_> {
     fn event(&mut self, event: ScanEvent) {
         if let ScanEvent::Lost { device, error } = &event {
@@ -215,11 +232,11 @@ impl ScanWatch for Follower<'_> {
 
     fn profile(&mut self, view: usize, profile: &Profile, points: &[DVec3]) {
         self.acquisition.live.push(view, profile, points);
-        if let Some(Ok(writer)) = self.writer
-            && let Err(error) = writer.push(view, profile)
-        {
-            *self.writer = Some(Err(chain(&error)));
-        }
+        self.keep(|writer| writer.push(view, profile));
+    }
+
+    fn pose(&mut self, pose: &Pose) {
+        self.keep(|writer| writer.push_pose(pose));
     }
 
     fn aborted(&mut self) -> bool {

@@ -56,7 +56,8 @@ pub struct LivePoints {
     pub points: Vec<[f32; 3]>,
 }
 
-/// The newest profile of one device.
+/// The newest profile of one device in which anything was seen: past the end of the part a sensor looks into the void, and the
+/// last of the part is what there is to show.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, ToSchema)]
 pub struct LiveProfile {
     /// The device.
@@ -115,6 +116,9 @@ impl Live {
                 inner.thin();
             }
         }
+        if !profile.z_mm.iter().any(|z| z.is_finite()) {
+            return;
+        }
         let stride = profile.x_mm.len().div_ceil(COLUMNS_SHOWN).max(1);
         if let Some(shown) = inner.profiles.get_mut(view) {
             shown.sequence = profile.sequence;
@@ -138,7 +142,7 @@ impl Live {
         }
     }
 
-    /// The newest profile of every device.
+    /// The newest profile of every device in which anything was seen; an empty one before that.
     pub fn profiles(&self) -> Vec<LiveProfile> {
         self.lock().profiles.clone()
     }
@@ -170,5 +174,39 @@ impl Inner {
         });
         self.stride *= 2;
         self.generation += 1;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Instant;
+
+    use super::*;
+
+    #[test]
+    fn behind_the_part_the_last_profile_of_it_stays() {
+        let profile = |sequence, z: f64| Profile {
+            sequence,
+            boot: 0,
+            device_time_ns: 0,
+            encoder: None,
+            host_time: Instant::now(),
+            dropped: 0,
+            saturated: false,
+            x_mm: vec![0.0, 1.0],
+            z_mm: vec![z, f64::NAN],
+            intensity: Vec::new(),
+        };
+        let live = Live::default();
+        live.begin(1, &["left".to_owned()]);
+        live.push(0, &profile(0, f64::NAN), &[]);
+        assert_eq!(live.profiles()[0].z_mm, []);
+        live.push(0, &profile(1, 5.0), &[]);
+        live.push(0, &profile(2, f64::NAN), &[]);
+        let shown = &live.profiles()[0];
+        assert_eq!(
+            (shown.sequence, &shown.z_mm[..]),
+            (1, &[Some(5.0), None][..])
+        );
     }
 }

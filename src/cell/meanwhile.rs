@@ -5,7 +5,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, TryRecvError, channel}
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use acies_drivers::capture::Profile;
+use acies_drivers::capture::{Pose, Profile};
 use glam::DVec3;
 
 use super::Part;
@@ -210,6 +210,10 @@ impl ScanWatch for Feeding<'_> {
         if waiting.len() >= PIECE {
             self.hand_over(view);
         }
+    }
+
+    fn pose(&mut self, pose: &Pose) {
+        self.inner.pose(pose);
     }
 
     fn aborted(&mut self) -> bool {

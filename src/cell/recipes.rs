@@ -103,6 +103,25 @@ fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<Option<(i64, Part
     Ok(Some((version.id, part)))
 }
 
+/// Whether two versions judge alike: the same nominal, limits, decision rule, datums and uncertainties. They may differ in words, and
+/// in how densely and how deeply an edge is looked at.
+///
+/// # Errors
+/// [`CellError::Recipe`].
+pub fn judge_alike(one: &RecipeContent, other: &RecipeContent) -> Result<bool, CellError> {
+    let judging = |content: &RecipeContent| {
+        let mut recipe = check_recipe(&content.text, &content.version.name)?;
+        recipe.sha256.clear();
+        (recipe.station_step_mm, recipe.flank_mm) = (None, None);
+        for edge in &mut recipe.edges {
+            edge.station_step_mm = None;
+        }
+        Ok::<_, CellError>(recipe)
+    };
+    let same_part = one.version.nominal_sha256 == other.version.nominal_sha256;
+    Ok(same_part && judging(one)? == judging(other)?)
+}
+
 /// Reads a version.
 ///
 /// # Errors

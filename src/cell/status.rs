@@ -7,7 +7,7 @@ use super::{Mode, State};
 use crate::store::{Inspection, RecipeVersion, Usage};
 
 /// Everything that is so at one moment.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, ToSchema)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize, ToSchema)]
 pub struct Snapshot {
     /// Rises with every change.
     pub sequence: u64,

@@ -1,14 +1,14 @@
 //! `acies export`: the history for those who analyse elsewhere.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{BufWriter, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 
 use super::serve::read_cell;
 use super::{Failure, Status};
-use crate::store::{self, History, Store};
+use crate::store::{self, ExportError, History, Store};
 
 /// Writes every result of a cell's store, newest first.
 #[derive(Debug, clap::Args)]
@@ -57,24 +57,42 @@ impl Export {
             order_number: self.order,
             ..History::default()
         };
-        let mut out: Box<dyn Write + Send> = match &self.output {
-            None => Box::new(std::io::stdout()),
+        let written = match &self.output {
+            None => store
+                .export(form, &history, &mut std::io::stdout())
+                .map_err(|error| Failure::Io(error.into()))?,
             Some(path) => {
-                let file = File::create(path)
-                    .with_context(|| {
-                        format!(
-                            "{}: cannot be written; choose another file with --output",
-                            path.display()
-                        )
-                    })
-                    .map_err(Failure::Io)?;
-                Box::new(BufWriter::new(file))
+                into_file(path, |out| store.export(form, &history, out)).map_err(Failure::Io)?
             }
         };
-        let written = store
-            .export(form, &history, &mut out)
-            .map_err(|error| Failure::Io(error.into()))?;
         tracing::info!(inspections = written, "exported");
         Ok(Status::Done)
     }
+}
+
+/// Writes a file that has its name only when it is whole; nothing is left of one that failed.
+fn into_file(
+    path: &Path,
+    write: impl FnOnce(&mut (dyn Write + Send)) -> Result<u64, ExportError>,
+) -> anyhow::Result<u64> {
+    let place = || {
+        format!(
+            "{}: cannot be written; choose another file with --output",
+            path.display()
+        )
+    };
+    let mut part = path.as_os_str().to_owned();
+    part.push(".part");
+    let part = PathBuf::from(part);
+    let file = File::create(&part).with_context(place)?;
+    let written = write(&mut BufWriter::new(file)).map_err(anyhow::Error::from);
+    let placed = written.and_then(|count| {
+        fs::rename(&part, path).with_context(place)?;
+        Ok(count)
+    });
+    if placed.is_err() {
+        // It failed already; that is what is told.
+        let _ = fs::remove_file(&part);
+    }
+    placed
 }

@@ -79,9 +79,9 @@ struct Place {
 enum RoleArgument {
     /// Starts, stops, looks.
     Operator,
-    /// Changes recipes.
+    /// Prepares recipes, activates those that were in force before.
     Setter,
-    /// Sees the audit log.
+    /// Puts limits and decision rules in force, sees the audit log.
     Metrologist,
     /// Adds people, makes backups.
     Administrator,

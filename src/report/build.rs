@@ -55,6 +55,7 @@ impl Report {
             verdict,
             reason: String::new(),
             advice: String::new(),
+            because: None,
             recipe: recipe_on_the_wire(&facts.recipe),
             scan: scan_from_facts(facts),
             devices: devices_from_facts(facts),
@@ -76,7 +77,10 @@ impl Report {
             findings,
             seconds: seconds_by_stage(&inspection.seconds),
         };
-        (report.reason, report.advice) = conclusion::conclude(&report);
+        let because = conclusion::conclude(&report);
+        report.reason = because.reason();
+        report.advice = because.advice().to_owned();
+        report.because = Some(because);
         report
     }
 }

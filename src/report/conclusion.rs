@@ -1,10 +1,10 @@
-//! Why the verdict is what it is, and what to do, in two sentences for the operator.
+//! Why the verdict is what it is, and what to do, for the operator.
 
-use super::figure::Figure;
+use super::because::{AdviceCode, Because, ReasonCode};
 use super::wire::{Characteristic, Edge, Report, Status};
 
 /// Reason and advice.
-pub fn conclude(report: &Report) -> (String, String) {
+pub fn conclude(report: &Report) -> Because {
     match report.verdict {
         Status::NotOk => not_ok(report),
         Status::NotDecidable => not_decidable(report),
@@ -13,78 +13,89 @@ pub fn conclude(report: &Report) -> (String, String) {
     }
 }
 
-fn not_ok(report: &Report) -> (String, String) {
+fn not_ok(report: &Report) -> Because {
     let bad = edges_with(report, Status::NotOk);
     let worst = characteristics_with(report, Status::NotOk).max_by(|a, b| {
         let excess = |(_, c): &(&Edge, &Characteristic)| excess_over_limit(c);
         excess(a).total_cmp(&excess(b))
     });
-    let reason = match worst {
-        Some((edge, characteristic)) => format!(
-            "{}: {}{}",
-            edge.id,
-            outside(characteristic),
-            others(bad.len())
-        ),
-        None if !report.missing_edges.is_empty() => format!(
-            "the scan has no edge where the nominal has {}",
-            list(&report.missing_edges)
-        ),
-        None if !bad.is_empty() => format!("outside the limits: {}", list(&bad)),
-        None => "the inspection found the part not OK".to_owned(),
-    };
-    let advice = "set the part aside; look at the marked place before anything is reworked";
-    (reason, advice.to_owned())
+    let advice = AdviceCode::SetAside;
+    match worst {
+        Some(worst) => about(worst, ReasonCode::OutsideLimits, advice, bad.len()),
+        None if !report.missing_edges.is_empty() => Because {
+            names: report.missing_edges.clone(),
+            ..Because::plain(ReasonCode::EdgesMissing, advice)
+        },
+        None if !bad.is_empty() => Because {
+            names: bad,
+            ..Because::plain(ReasonCode::EdgesOutside, advice)
+        },
+        None => Because::plain(ReasonCode::PartNotOk, advice),
+    }
 }
 
-fn not_decidable(report: &Report) -> (String, String) {
+fn not_decidable(report: &Report) -> Because {
     if report.alignment.status >= Status::NotDecidable {
         let weak = &report.alignment.weak_directions;
-        let reason = if weak.is_empty() {
-            "the scan could not be aligned to the nominal well enough".to_owned()
+        let code = if weak.is_empty() {
+            ReasonCode::NotAligned
         } else {
-            format!("the scan holds the part only weakly: {}", list(weak))
+            ReasonCode::HeldWeakly
         };
-        let advice =
-            "scan surfaces that fix these directions, or touch datum faces, then measure again";
-        return (reason, advice.to_owned());
+        return Because {
+            names: weak.clone(),
+            ..Because::plain(code, AdviceCode::FixDirections)
+        };
     }
     let open = edges_with(report, Status::NotDecidable);
     let in_zone = characteristics_with(report, Status::NotDecidable).next();
     match in_zone {
-        Some((edge, characteristic)) => (
-            format!(
-                "{}: {}{}",
-                edge.id,
-                inside_zone(characteristic),
-                others(open.len())
-            ),
-            "measure again with more points on both sides of the edge, so that the uncertainty shrinks"
-                .to_owned(),
+        Some(found) => about(
+            found,
+            ReasonCode::LimitInsideUncertainty,
+            AdviceCode::MorePoints,
+            open.len(),
         ),
-        None => (
-            gaps(report, &open),
-            "scan the missing stretches again, from a direction that sees both sides of the edge"
-                .to_owned(),
-        ),
+        None => gaps(report, &open),
     }
 }
 
-fn gaps(report: &Report, open: &[String]) -> String {
+/// A reason that `edges` edges have, told at one of them. One without a value is not said to lie anywhere.
+fn about(
+    (edge, found): (&Edge, &Characteristic),
+    code: ReasonCode,
+    advice: AdviceCode,
+    edges: usize,
+) -> Because {
+    let (code, detail) = match found.value {
+        Some(_) => (code, String::new()),
+        None => (ReasonCode::NoValue, found.reason.clone()),
+    };
+    Because {
+        edge: Some(edge.id.clone()),
+        characteristic: Some(found.into()),
+        count: edges.saturating_sub(1),
+        detail,
+        ..Because::plain(code, advice)
+    }
+}
+
+fn gaps(report: &Report, open: &[String]) -> Because {
     let least = report
         .edges
         .iter()
         .filter(|edge| edge.verdict == Status::NotDecidable)
         .min_by(|a, b| a.coverage.total_cmp(&b.coverage));
+    let advice = AdviceCode::ScanAgain;
     match least {
-        Some(edge) => format!(
-            "{}: {:.0} % of the edge was measured{}{}",
-            edge.id,
-            edge.coverage * 100.0,
-            first_reason(edge).map_or_else(String::new, |reason| format!(" ({reason})")),
-            others(open.len())
-        ),
-        None => "the data do not allow a verdict".to_owned(),
+        Some(edge) => Because {
+            edge: Some(edge.id.clone()),
+            coverage: Some(edge.coverage),
+            count: open.len().saturating_sub(1),
+            detail: first_reason(edge).unwrap_or_default().to_owned(),
+            ..Because::plain(ReasonCode::PartlyMeasured, advice)
+        },
+        None => Because::plain(ReasonCode::DataInadequate, advice),
     }
 }
 
@@ -95,38 +106,29 @@ fn first_reason(edge: &Edge) -> Option<&str> {
         .find(|reason| !reason.is_empty())
 }
 
-fn ok(report: &Report) -> (String, String) {
+fn ok(report: &Report) -> Because {
     let judged = characteristics_with(report, Status::Ok).count();
     let tightest = characteristics_with(report, Status::Ok)
         .max_by(|a, b| used_share(a.1).total_cmp(&used_share(b.1)));
-    let reason = match tightest {
-        Some((edge, characteristic)) => format!(
-            "all {judged} values are within their limits; nearest to one is {}, where {}{}",
-            edge.id,
-            stated(characteristic),
-            limits(characteristic)
-        ),
-        None => "nothing is outside its limits".to_owned(),
-    };
-    (reason, "the part may pass".to_owned())
+    match tightest {
+        Some((edge, found)) => Because {
+            edge: Some(edge.id.clone()),
+            characteristic: Some(found.into()),
+            count: judged,
+            detail: found.reason.clone(),
+            ..Because::plain(ReasonCode::AllWithin, AdviceCode::Pass)
+        },
+        None => Because::plain(ReasonCode::NoneOutside, AdviceCode::Pass),
+    }
 }
 
-fn undefined(report: &Report) -> (String, String) {
+fn undefined(report: &Report) -> Because {
     if report.edges.is_empty() {
-        (
-            "the nominal has no sharp edge to measure".to_owned(),
-            "check that the right nominal was given".to_owned(),
-        )
+        Because::plain(ReasonCode::NoSharpEdge, AdviceCode::CheckNominal)
     } else if report.edges.iter().all(|edge| edge.summary.measured == 0) {
-        (
-            "no edge was measured".to_owned(),
-            "check that scan and nominal are the same part, in the same unit".to_owned(),
-        )
+        Because::plain(ReasonCode::NothingMeasured, AdviceCode::CheckUnit)
     } else {
-        (
-            "no limits were given, so the values are stated and not judged".to_owned(),
-            "give limits in a recipe to get a verdict".to_owned(),
-        )
+        Because::plain(ReasonCode::NoLimits, AdviceCode::GiveLimits)
     }
 }
 
@@ -169,83 +171,5 @@ pub fn used_share(characteristic: &Characteristic) -> f64 {
         (Some(value), Some(lower), None) if value > 0.0 => lower / value,
         (Some(_), None, None) | (None, ..) => 0.0,
         (Some(_), ..) => f64::MAX,
-    }
-}
-
-fn outside(characteristic: &Characteristic) -> String {
-    if characteristic.value.is_none() {
-        return format!("{}{}", stated(characteristic), limits(characteristic));
-    }
-    format!(
-        "{}, outside its limits{}",
-        stated(characteristic),
-        limits(characteristic)
-    )
-}
-
-fn inside_zone(characteristic: &Characteristic) -> String {
-    if characteristic.value.is_none() {
-        return format!("{}{}", stated(characteristic), limits(characteristic));
-    }
-    format!(
-        "{}; a limit lies inside this uncertainty{}",
-        stated(characteristic),
-        limits(characteristic)
-    )
-}
-
-/// ` (−100 to +100 µm)`.
-fn limits(characteristic: &Characteristic) -> String {
-    let figure = |limit| Figure::of(characteristic.quantity, limit, None);
-    match (characteristic.lower, characteristic.upper) {
-        (Some(lower), Some(upper)) => {
-            format!(
-                " ({} to {})",
-                figure(lower).value,
-                figure(upper).with_unit()
-            )
-        }
-        (None, Some(upper)) => format!(" (at most {})", figure(upper).with_unit()),
-        (Some(lower), None) => format!(" (at least {})", figure(lower).with_unit()),
-        (None, None) => String::new(),
-    }
-}
-
-/// `d1 is +152 µm (U 12 µm) at 12.4 mm along the edge`.
-pub fn stated(characteristic: &Characteristic) -> String {
-    let name = characteristic.quantity.words();
-    let Some(value) = characteristic.value else {
-        return match characteristic.reason.as_str() {
-            "" => format!("{name} was not measured"),
-            reason => format!("{name} has no value: {reason}"),
-        };
-    };
-    let figure = Figure::of(characteristic.quantity, value, characteristic.u);
-    let place = characteristic
-        .s_mm
-        .map_or_else(String::new, |s| format!(" at {s:.1} mm along the edge"));
-    format!("{name} is {}{place}", figure.with_uncertainty())
-}
-
-fn others(count: usize) -> String {
-    match count {
-        0 | 1 => String::new(),
-        2 => "; one more edge likewise".to_owned(),
-        more => format!("; {} more edges likewise", more - 1),
-    }
-}
-
-/// At most five words of a list, then a count.
-fn list(items: &[String]) -> String {
-    const SHOWN: usize = 5;
-    let shown = items
-        .iter()
-        .take(SHOWN)
-        .cloned()
-        .collect::<Vec<_>>()
-        .join(", ");
-    match items.len().saturating_sub(SHOWN) {
-        0 => shown,
-        more => format!("{shown} and {more} more"),
     }
 }

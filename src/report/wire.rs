@@ -7,6 +7,7 @@ use indexmap::IndexMap;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+pub use super::because::{AdviceCode, Because, Judged, ReasonCode};
 pub use crate::inspect::quantity::Quantity;
 
 /// A position (mm) or a direction: x, y, z.
@@ -36,6 +37,9 @@ pub struct Report {
     pub reason: String,
     /// What to do next, in one sentence.
     pub advice: String,
+    /// Reason and advice in parts, for programs and other languages; not in a report that was written before this key was added.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub because: Option<Because>,
     /// What the values were judged by.
     pub recipe: Recipe,
     /// What the scan is like.

@@ -8,7 +8,7 @@ use utoipa::{IntoParams, ToSchema};
 
 use super::{Store, StoreError, millis, pack, rfc3339, unpack};
 use crate::report::Report;
-use crate::report::wire::Status;
+use crate::report::wire::{Because, Status};
 
 /// Why a part is measured.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize, ToSchema)]
@@ -130,6 +130,9 @@ pub struct Inspection {
     pub verdict: Option<Status>,
     /// Why the verdict is what it is, or why there is none, in one sentence.
     pub reason: String,
+    /// The verdict's reason in parts, for other languages; null where there is no verdict, or an older one.
+    #[serde(default)]
+    pub because: Option<Because>,
     /// Points measured.
     pub points: Option<i64>,
     /// From the first profile to the last, s.
@@ -225,7 +228,7 @@ pub struct Trend {
 }
 
 const COLUMNS: &str = "id, phase, part_serial, order_number, purpose, operator, recipe_id, remeasure_of, simulated, requested_ms,
-    started_ms, acquired_ms, ended_ms, verdict, reason, points, scan_seconds, verdict_seconds, scan_bytes, scan_whole";
+    started_ms, acquired_ms, ended_ms, verdict, reason, points, scan_seconds, verdict_seconds, scan_bytes, scan_whole, because";
 
 /// Largest page of a history or a trend.
 const PAGE_MAX: u32 = 500;
@@ -367,6 +370,8 @@ impl Store {
         at: SystemTime,
     ) -> Result<Inspection, StoreError> {
         let json = pack(&serde_json::to_string(finished.report).unwrap_or_default());
+        let because = finished.report.because.as_ref();
+        let because = because.and_then(|because| serde_json::to_string(because).ok());
         let measured = measured(finished.report);
         self.write(|connection| {
             let transaction = connection.transaction()?;
@@ -379,7 +384,7 @@ impl Store {
             }
             transaction.execute(
                 "UPDATE inspections SET phase = 'done', ended_ms = ?2, verdict = ?3, reason = ?4, simulated = ?5,
-                 scan_seconds = ?6, verdict_seconds = ?7 WHERE id = ?1",
+                 scan_seconds = ?6, verdict_seconds = ?7, because = ?8 WHERE id = ?1",
                 params![
                     id,
                     millis(at),
@@ -387,7 +392,8 @@ impl Store {
                     finished.report.reason,
                     finished.report.simulated,
                     finished.scan_seconds,
-                    finished.verdict_seconds
+                    finished.verdict_seconds,
+                    because,
                 ],
             )?;
             let inspection = one(&transaction, id)?;
@@ -487,12 +493,9 @@ impl Store {
                 )
                 .optional()
         })?;
-        packed
-            .as_deref()
-            .and_then(unpack)
-            .ok_or_else(|| StoreError::Missing {
-                what: format!("the report of inspection {id}"),
-            })
+        let what = || format!("the report of inspection {id}");
+        let packed = packed.ok_or_else(|| StoreError::Missing { what: what() })?;
+        unpack(&packed).ok_or_else(|| StoreError::Damaged { what: what() })
     }
 
     /// The file of an inspection's raw data.
@@ -647,6 +650,9 @@ fn inspection(row: &Row<'_>) -> rusqlite::Result<Inspection> {
         verdict_seconds: row.get(17)?,
         scan_bytes: row.get(18)?,
         scan_whole: row.get(19)?,
+        because: row
+            .get::<_, Option<String>>(20)?
+            .and_then(|json| serde_json::from_str(&json).ok()),
     })
 }
 

@@ -17,9 +17,9 @@ use super::{Store, StoreError, millis, rfc3339};
 pub enum Role {
     /// Starts, stops, looks.
     Operator,
-    /// Changes recipes.
+    /// Prepares recipes, activates those that were in force before.
     Setter,
-    /// Answers for calibration and uncertainty, and sees the audit log.
+    /// Answers for limits, decision rule and uncertainty: puts them in force, and sees the audit log.
     Metrologist,
     /// Adds people, makes backups.
     Administrator,

@@ -33,6 +33,9 @@ pub struct RecipeVersion {
     pub created: String,
     /// Whether parts are judged by it now.
     pub active: bool,
+    /// Whether parts were judged by it before: then its limits were put in force by somebody who may.
+    #[serde(default)]
+    pub released: bool,
 }
 
 /// A version with its text.
@@ -75,7 +78,8 @@ impl NewRecipe<'_> {
 }
 
 const COLUMNS: &str = "id, name, version, sha256, nominal_name, nominal_sha256, author, why, created_ms,
-    id = coalesce((SELECT CAST(value AS INTEGER) FROM settings WHERE settings.name = 'active_recipe'), 0)";
+    id = coalesce((SELECT CAST(value AS INTEGER) FROM settings WHERE settings.name = 'active_recipe'), 0),
+    released";
 
 impl Store {
     /// Adds a version, or finds the one with the same content. The caller has checked that text and nominal can be read.
@@ -169,7 +173,7 @@ impl Store {
         })
     }
 
-    /// Parts are judged by version `id` from now on.
+    /// Parts are judged by version `id` from now on, which is released by that. The caller has checked that this person may.
     ///
     /// # Errors
     /// [`StoreError::Missing`] and [`StoreError::Database`].
@@ -195,6 +199,7 @@ impl Store {
                  ON CONFLICT (name) DO UPDATE SET value = excluded.value",
                 [id.to_string()],
             )?;
+            transaction.execute("UPDATE recipes SET released = 1 WHERE id = ?1", [id])?;
             let entry = Audit {
                 person,
                 action: "recipe.activate",
@@ -289,8 +294,9 @@ fn whole(row: &Row<'_>) -> rusqlite::Result<(RecipeVersion, String)> {
         why: row.get(7)?,
         created: rfc3339(row.get(8)?),
         active: row.get(9)?,
+        released: row.get(10)?,
     };
-    Ok((version, row.get(10)?))
+    Ok((version, row.get(11)?))
 }
 
 fn hex(bytes: &[u8]) -> String {

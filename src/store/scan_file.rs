@@ -5,23 +5,29 @@
 //! ```
 //!
 //! Little-endian throughout. A chunk of kind 0 names a view (JSON), one of kind 1 holds profiles (zstd), one of kind 2 is the
-//! end of a run that was not cut short. While the run lasts the file is called `NAME.part`; each chunk is handed to the system as soon as it is full, so that
-//! after a crash everything up to the last whole chunk can be read. A chunk of profiles holds the numbers of each profile as
-//! the difference (exclusive or) to the profile before, one byte plane after the other: a sensor's grid stands still and its
-//! heights change little, so that most planes are zeros.
+//! end of a run that was not cut short. While the run lasts the file is called `NAME.part`; each chunk is handed to the system as
+//! soon as it is full, so that after a crash everything up to the last whole chunk can be read. A chunk of profiles holds the
+//! numbers of each profile as the difference (exclusive or) to the profile before, one byte plane after the other: a sensor's
+//! grid stands still and its heights change little, so that most planes are zeros.
+//!
+//! Where a robot carried the profilers there is more, for the points follow from poses and clocks: a chunk of kind 3 holds poses
+//! (zstd; time of the robot's clock, position, turn: seven f64; receipt), one of kind 4 stands before the profiles of a view and
+//! says when each was received (zstd; view u16, receipts). A receipt is an i64: nanoseconds of the host's clock from the first
+//! receipt in the file on.
 
+use std::collections::VecDeque;
 use std::fs::{self, File};
 use std::io::{self, BufReader, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
-use acies_drivers::capture::Profile;
+use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::Identity;
 use crc::{CRC_32_ISCSI, Crc};
 use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 
-use crate::acquire::{Assembler, Calibration};
+use crate::acquire::{Assembler, Calibration, CarriedRecord, CarriedView};
 use crate::geometry::RigidTransform;
 use crate::points::PointCloud;
 
@@ -37,6 +43,12 @@ const COLUMNS_MAX: usize = 1 << 16;
 const VIEW: u8 = 0;
 const PROFILES: u8 = 1;
 const END: u8 = 2;
+const POSES: u8 = 3;
+const RECEIPTS: u8 = 4;
+/// Poses that are kept back at most: a second of a robot that sends every 2 ms.
+const POSES_A_CHUNK: usize = 500;
+/// Bytes of a pose: eight numbers.
+const POSE: usize = 64;
 
 /// Why a scan's file could not be written or read.
 #[derive(Debug, thiserror::Error)]
@@ -64,9 +76,9 @@ pub enum ScanFileError {
         /// What belongs there.
         expected: &'static str,
     },
-    /// The points of a run by a robot.
+    /// The points of a run by a robot, in a file of a version that did not keep poses.
     #[error(
-        "{path}: a robot carried the profilers, and its poses are not in the file: the profiles can be read, the points cannot be placed again"
+        "{path}: a robot carried the profilers, and its poses are not in this old file: the profiles can be read, the points cannot be placed again"
     )]
     Carried {
         /// Which.
@@ -83,8 +95,19 @@ pub struct StoredView {
     pub identity: Identity,
     /// Where it was.
     pub calibration: Calibration,
-    /// Whether a robot carried it: the poses of a robot are not in the file.
+    /// Whether a robot carried it.
     pub carried: bool,
+    /// That robot; `None` also in files of versions that did not keep its poses.
+    pub carrier: Option<StoredCarrier>,
+}
+
+/// The robot that carried the profilers of a stored run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StoredCarrier {
+    /// Where its base stood.
+    pub machine_from_base: RigidTransform,
+    /// Added to the time of a profile before its pose is looked up, s.
+    pub lag_s: f64,
 }
 
 /// [`StoredView`] in JSON.
@@ -101,6 +124,17 @@ struct WireView {
     travel_mm_per_count: [f64; 3],
     #[serde(default)]
     carried: bool,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    carrier: Option<WireCarrier>,
+}
+
+/// [`StoredCarrier`] in JSON.
+#[derive(Serialize, Deserialize)]
+struct WireCarrier {
+    /// x, y, z, w.
+    rotation: [f64; 4],
+    translation_mm: [f64; 3],
+    lag_s: f64,
 }
 
 /// Writes the profiles of a run while it lasts.
@@ -110,6 +144,10 @@ pub struct ScanWriter {
     part: PathBuf,
     file: BufWriter<File>,
     pending: Vec<Chunk>,
+    poses: Vec<u8>,
+    /// The first receipt, where a robot carries the profilers.
+    first: Option<Instant>,
+    carried: bool,
     bytes: u64,
     profiles: u64,
 }
@@ -120,6 +158,7 @@ struct Chunk {
     profiles: Vec<u8>,
     numbers: Vec<u64>,
     before: Vec<u64>,
+    receipts: Vec<u8>,
 }
 
 impl ScanWriter {
@@ -140,6 +179,9 @@ impl ScanWriter {
             part,
             file: BufWriter::new(file),
             pending: views.iter().map(|_| Chunk::default()).collect(),
+            poses: Vec::new(),
+            first: None,
+            carried: views.iter().any(|view| view.carrier.is_some()),
             bytes: MAGIC.len() as u64,
             profiles: 0,
         };
@@ -157,12 +199,44 @@ impl ScanWriter {
     /// # Errors
     /// [`ScanFileError::File`]; the run may go on, its file is lost.
     pub fn push(&mut self, view: usize, profile: &Profile) -> Result<(), ScanFileError> {
+        if self.carried {
+            let receipt = self.receipt(profile.host_time);
+            self.pending[view].receipts.extend(receipt.to_le_bytes());
+        }
         self.pending[view].push(profile);
         self.profiles += 1;
         if self.pending[view].numbers.len() >= 2 * COLUMNS_A_CHUNK {
             self.flush(view)?;
         }
         Ok(())
+    }
+
+    /// Takes one pose of the robot.
+    ///
+    /// # Errors
+    /// As [`ScanWriter::push`].
+    pub fn push_pose(&mut self, pose: &Pose) -> Result<(), ScanFileError> {
+        let numbers = [pose.device_time_s].into_iter();
+        let numbers = numbers.chain(pose.position_mm).chain(pose.rotation);
+        let receipt = self.receipt(pose.host_time);
+        for number in numbers {
+            self.poses.extend(number.to_le_bytes());
+        }
+        self.poses.extend(receipt.to_le_bytes());
+        if self.poses.len() >= POSES_A_CHUNK * POSE {
+            self.flush_poses()?;
+        }
+        Ok(())
+    }
+
+    /// Nanoseconds from the first receipt to `at`.
+    fn receipt(&mut self, at: Instant) -> i64 {
+        let first = *self.first.get_or_insert(at);
+        let nanos = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
+        match at.checked_duration_since(first) {
+            Some(later) => nanos(later),
+            None => -nanos(first.duration_since(at)),
+        }
     }
 
     /// Ends the file, brings it onto the disk and gives it its name. Returns its size, bytes; 0 where there was no profile,
@@ -178,6 +252,7 @@ impl ScanWriter {
         for view in 0..self.pending.len() {
             self.flush(view)?;
         }
+        self.flush_poses()?;
         if whole {
             self.chunk(END, &[])?;
         }
@@ -196,10 +271,23 @@ impl ScanWriter {
         if chunk.profiles.is_empty() {
             return Ok(());
         }
-        let payload = chunk.pack(view);
-        self.chunk(PROFILES, &payload)?;
+        self.flush_poses()?;
+        if !chunk.receipts.is_empty() {
+            let mut plain = (view as u16).to_le_bytes().to_vec();
+            plain.extend(&chunk.receipts);
+            self.chunk(RECEIPTS, &packed(&plain))?;
+        }
+        self.chunk(PROFILES, &packed(&chunk.plain(view)))?;
         let flushed = self.file.flush();
         self.io(flushed)
+    }
+
+    fn flush_poses(&mut self) -> Result<(), ScanFileError> {
+        let poses = std::mem::take(&mut self.poses);
+        if poses.is_empty() {
+            return Ok(());
+        }
+        self.chunk(POSES, &packed(&poses))
     }
 
     fn chunk(&mut self, kind: u8, payload: &[u8]) -> Result<(), ScanFileError> {
@@ -258,7 +346,7 @@ impl Chunk {
         self.before = numbers;
     }
 
-    fn pack(&self, view: usize) -> Vec<u8> {
+    fn plain(&self, view: usize) -> Vec<u8> {
         let mut plain = Vec::with_capacity(10 + self.profiles.len() + 8 * self.numbers.len());
         plain.extend((view as u16).to_le_bytes());
         plain.extend((self.profiles.len() as u32).to_le_bytes());
@@ -271,20 +359,29 @@ impl Chunk {
                     .map(|number| (number >> (8 * plane)) as u8),
             );
         }
-        // Level 1: the byte planes do most of the work, and the run waits for us.
-        zstd::encode_all(plain.as_slice(), 1).unwrap_or_default()
+        plain
     }
+}
+
+fn packed(plain: &[u8]) -> Vec<u8> {
+    // Level 1: the byte planes do most of the work, and the run waits for us. Memory is read and written: that cannot fail.
+    zstd::encode_all(plain, 1).unwrap_or_default()
 }
 
 /// Reads the profiles of a run, one chunk at a time.
 #[derive(Debug)]
-pub struct ScanReader {
+pub struct ScanReader<R = BufReader<File>> {
     path: PathBuf,
-    file: BufReader<File>,
+    file: R,
     at: u64,
     views: Vec<StoredView>,
     /// A chunk that was read while looking for the last view.
     ahead: Option<(u8, Vec<u8>)>,
+    /// What receipts are told from.
+    first: Instant,
+    poses: Vec<Pose>,
+    /// Receipts of profiles that are still to come, by view.
+    receipts: Vec<VecDeque<i64>>,
     ended: bool,
 }
 
@@ -298,12 +395,25 @@ impl ScanReader {
             path: path.to_owned(),
             source,
         })?;
+        Self::read(BufReader::new(file), path)
+    }
+}
+
+impl<R: Read> ScanReader<R> {
+    /// Reads from `file`, which errors call `path`.
+    ///
+    /// # Errors
+    /// [`ScanFileError`].
+    pub fn read(file: R, path: &Path) -> Result<Self, ScanFileError> {
         let mut reader = Self {
             path: path.to_owned(),
-            file: BufReader::new(file),
+            file,
             at: 0,
             views: Vec::new(),
             ahead: None,
+            first: Instant::now(),
+            poses: Vec::new(),
+            receipts: Vec::new(),
             ended: false,
         };
         let mut magic = [0; MAGIC.len()];
@@ -322,6 +432,7 @@ impl ScanReader {
             let wire = serde_json::from_slice::<WireView>(&payload);
             let wire = wire.map_err(|error| reader.damaged(error.to_string(), "a view in JSON"))?;
             reader.views.push(unwire(wire));
+            reader.receipts.push(VecDeque::new());
         }
         Ok(reader)
     }
@@ -342,8 +453,7 @@ impl ScanReader {
     /// As [`ScanReader::profiles`].
     pub fn into_cloud(mut self) -> Result<PointCloud, ScanFileError> {
         if self.views.iter().any(|view| view.carried) {
-            let path = self.path;
-            return Err(ScanFileError::Carried { path });
+            return self.carried_cloud();
         }
         let views = self.views.iter();
         let mut assemblers: Vec<Assembler> = views
@@ -359,25 +469,60 @@ impl ScanReader {
             .map_err(|error| self.damaged(error.to_string(), "at least one view"))
     }
 
+    /// The points of a run by a robot: as its profiles came together, so they are placed.
+    fn carried_cloud(mut self) -> Result<PointCloud, ScanFileError> {
+        let Some(carrier) = self.views.iter().find_map(|view| view.carrier) else {
+            return Err(ScanFileError::Carried { path: self.path });
+        };
+        let mut taken: Vec<Vec<Profile>> = self.views.iter().map(|_| Vec::new()).collect();
+        while let Some((view, profiles)) = self.profiles()? {
+            taken[view].extend(profiles);
+        }
+        let views = self.views.iter().zip(&taken);
+        let record = CarriedRecord {
+            views: views
+                .map(|(view, profiles)| CarriedView {
+                    device: &view.device,
+                    tool_from_sensor: view.calibration.machine_from_sensor,
+                    profiles,
+                })
+                .collect(),
+            poses: &self.poses,
+            machine_from_base: carrier.machine_from_base,
+            lag_s: carrier.lag_s,
+        };
+        Ok(record.cloud())
+    }
+
+    /// The robot's poses that were read since this was last asked, in order.
+    pub fn take_poses(&mut self) -> Vec<Pose> {
+        std::mem::take(&mut self.poses)
+    }
+
     /// The profiles of the next chunk, each with the index of its view; `None` at the end, or where a crash cut the file off.
     ///
     /// # Errors
     /// [`ScanFileError`] where what stands there is damaged and not merely missing.
     pub fn profiles(&mut self) -> Result<Option<(usize, Vec<Profile>)>, ScanFileError> {
-        let next = match self.ahead.take() {
-            Some(chunk) => Some(chunk),
-            None => self.chunk()?,
-        };
-        match next {
-            Some((PROFILES, payload)) => self.unpack(&payload).map(Some),
-            Some((END, _)) => {
-                self.ended = true;
-                Ok(None)
+        loop {
+            let next = match self.ahead.take() {
+                Some(chunk) => Some(chunk),
+                None => self.chunk()?,
+            };
+            match next {
+                Some((PROFILES, payload)) => return self.unpack(&payload).map(Some),
+                Some((POSES, payload)) => self.unpack_poses(&payload)?,
+                Some((RECEIPTS, payload)) => self.unpack_receipts(&payload)?,
+                Some((END, _)) => {
+                    self.ended = true;
+                    return Ok(None);
+                }
+                Some((kind, _)) => {
+                    let found = format!("a chunk of kind {kind}");
+                    return Err(self.damaged(found, "profiles, poses or the end"));
+                }
+                None => return Ok(None),
             }
-            Some((kind, _)) => {
-                Err(self.damaged(format!("a chunk of kind {kind}"), "profiles or the end"))
-            }
-            None => Ok(None),
         }
     }
 
@@ -420,9 +565,57 @@ impl ScanReader {
         }
     }
 
-    fn unpack(&self, payload: &[u8]) -> Result<(usize, Vec<Profile>), ScanFileError> {
-        let plain = zstd::bulk::decompress(payload, CHUNK_MAX)
-            .map_err(|error| self.damaged(error.to_string(), "profiles packed by zstd"))?;
+    fn plain(&self, payload: &[u8]) -> Result<Vec<u8>, ScanFileError> {
+        zstd::bulk::decompress(payload, CHUNK_MAX)
+            .map_err(|error| self.damaged(error.to_string(), "a chunk packed by zstd"))
+    }
+
+    fn unpack_poses(&mut self, payload: &[u8]) -> Result<(), ScanFileError> {
+        let plain = self.plain(payload)?;
+        let (poses, []) = plain.as_chunks::<POSE>() else {
+            return Err(self.damaged(format!("{} bytes", plain.len()), "poses of 64 bytes"));
+        };
+        for pose in poses {
+            let (numbers, _) = pose.as_chunks::<8>();
+            let number = |index: usize| f64::from_le_bytes(numbers[index]);
+            let receipt = i64::from_le_bytes(numbers[7]);
+            self.poses.push(Pose {
+                device_time_s: number(0),
+                position_mm: [number(1), number(2), number(3)],
+                rotation: [number(4), number(5), number(6)],
+                host_time: self.received(receipt)?,
+            });
+        }
+        Ok(())
+    }
+
+    fn unpack_receipts(&mut self, payload: &[u8]) -> Result<(), ScanFileError> {
+        let plain = self.plain(payload)?;
+        let mut bytes = Bytes(&plain);
+        let view = bytes.u16().map_or(usize::MAX, usize::from);
+        let (receipts, []) = bytes.0.as_chunks::<8>() else {
+            return Err(self.damaged(format!("{} bytes", plain.len()), "receipts of 8 bytes"));
+        };
+        let Some(waiting) = self.receipts.get_mut(view) else {
+            return Err(self.damaged(format!("view {view}"), "a view that the file names"));
+        };
+        waiting.extend(receipts.iter().map(|bytes| i64::from_le_bytes(*bytes)));
+        Ok(())
+    }
+
+    /// The moment of a receipt; where it stands says nothing, only how far it is from the others.
+    fn received(&self, receipt: i64) -> Result<Instant, ScanFileError> {
+        let apart = Duration::from_nanos(receipt.unsigned_abs());
+        let at = if receipt < 0 {
+            self.first.checked_sub(apart)
+        } else {
+            self.first.checked_add(apart)
+        };
+        at.ok_or_else(|| self.damaged(format!("a receipt at {receipt} ns"), "a moment of the run"))
+    }
+
+    fn unpack(&mut self, payload: &[u8]) -> Result<(usize, Vec<Profile>), ScanFileError> {
+        let plain = self.plain(payload)?;
         let short = || {
             self.damaged(
                 "too few bytes".to_owned(),
@@ -465,6 +658,11 @@ impl ScanReader {
             before = numbers;
             profiles.push(profile);
         }
+        for profile in &mut profiles {
+            if let Some(receipt) = self.receipts[view].pop_front() {
+                profile.host_time = self.received(receipt)?;
+            }
+        }
         Ok((view, profiles))
     }
 
@@ -494,7 +692,7 @@ fn profile_head(bytes: &mut Bytes<'_>) -> Option<(Profile, usize)> {
         boot,
         device_time_ns,
         encoder: (flags & 2 != 0).then_some(encoder),
-        // The host's clock of a run that is over says nothing any more.
+        // The host's clock of a run that is over says nothing any more, but where a robot carried: then it is set behind this.
         host_time: Instant::now(),
         dropped,
         saturated: flags & 1 != 0,
@@ -540,6 +738,11 @@ fn wire(view: &StoredView) -> WireView {
         translation_mm: pose.translation.to_array(),
         travel_mm_per_count: view.calibration.travel_mm_per_count.to_array(),
         carried: view.carried,
+        carrier: view.carrier.map(|carrier| WireCarrier {
+            rotation: carrier.machine_from_base.rotation.to_array(),
+            translation_mm: carrier.machine_from_base.translation.to_array(),
+            lag_s: carrier.lag_s,
+        }),
     }
 }
 
@@ -560,5 +763,12 @@ fn unwire(wire: WireView) -> StoredView {
             travel_mm_per_count: DVec3::from_array(wire.travel_mm_per_count),
         },
         carried: wire.carried,
+        carrier: wire.carrier.map(|carrier| StoredCarrier {
+            machine_from_base: RigidTransform {
+                rotation: DQuat::from_array(carrier.rotation),
+                translation: DVec3::from_array(carrier.translation_mm),
+            },
+            lag_s: carrier.lag_s,
+        }),
     }
 }

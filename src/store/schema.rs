@@ -4,7 +4,7 @@ use rusqlite_migration::{M, Migrations};
 
 /// Every version, in order.
 pub(super) fn migrations() -> Migrations<'static> {
-    Migrations::new(vec![M::up(FIRST)])
+    Migrations::new(vec![M::up(FIRST), M::up(BECAUSE), M::up(RELEASED)])
 }
 
 const FIRST: &str = "
@@ -109,6 +109,15 @@ CREATE TABLE audit (
 ) STRICT;
 CREATE TRIGGER audit_is_not_changed BEFORE UPDATE ON audit BEGIN SELECT RAISE (ABORT, 'the audit log is never changed'); END;
 CREATE TRIGGER audit_is_not_removed BEFORE DELETE ON audit BEGIN SELECT RAISE (ABORT, 'the audit log is never shortened'); END;
+";
+
+/// The reason of a verdict in parts, JSON; null where there is no result, or an older one.
+const BECAUSE: &str = "ALTER TABLE inspections ADD COLUMN because TEXT";
+
+/// Which recipes somebody who may has put in force once; those that were active before there was this column count.
+const RELEASED: &str = "
+ALTER TABLE recipes ADD COLUMN released INTEGER NOT NULL DEFAULT 0;
+UPDATE recipes SET released = 1 WHERE EXISTS (SELECT 1 FROM audit WHERE action = 'recipe.activate' AND instr(new, sha256) > 0);
 ";
 
 #[cfg(test)]

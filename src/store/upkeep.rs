@@ -123,7 +123,14 @@ impl Store {
         let cut = path.with_file_name(format!("{name}.cut"));
         let mut writer = ScanWriter::create(&cut, reader.views())?;
         // What is damaged behind the last whole chunk is what the crash cut off.
-        while let Ok(Some((view, profiles))) = reader.profiles() {
+        loop {
+            let read = reader.profiles();
+            for pose in reader.take_poses() {
+                writer.push_pose(&pose)?;
+            }
+            let Ok(Some((view, profiles))) = read else {
+                break;
+            };
             for profile in &profiles {
                 writer.push(view, profile)?;
             }

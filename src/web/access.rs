@@ -1,7 +1,8 @@
 //! Who may do what: one table of routes and roles, and the one place that asks it.
 //!
 //! Every request passes [`guard`]: the name it was called by (DNS rebinding), where it comes from (requests forged across sites),
-//! who sends it, and whether that role may. A route that does not stand in the table is closed.
+//! who sends it, and whether that role may. A route that does not stand in the table is closed, also where the router knows it:
+//! what was forgotten here is found by who misses it, not by who should not have it.
 
 use std::net::SocketAddr;
 use std::time::SystemTime;
@@ -153,17 +154,41 @@ async fn admit(app: &App, request: &Parts) -> Result<Who, Problem> {
         // Nothing stands there; the fallback says so.
         return Ok(who);
     };
-    let method = if safe { "GET" } else { request.method.as_str() };
-    let mut at_path = ROUTES.iter().filter(|route| route.1 == path.as_str());
-    let Some(need) = at_path.find(|route| route.0 == method).map(|route| route.2) else {
-        // A method that the router does not know there either: it answers 405.
-        return Ok(Who { role: None, ..who });
-    };
-    match (need, who.role) {
+    match (need(&request.method, path.as_str())?, who.role) {
         (Nothing, _) => Ok(who),
         (AtLeast(least), Some(role)) if role >= least => Ok(who),
         (AtLeast(least), _) => Err(not_allowed(&who, least)),
     }
+}
+
+/// The least that `method` asks for at `path`, a path of the router.
+///
+/// # Errors
+/// Where the table has no such route.
+fn need(method: &Method, path: &str) -> Result<Need, Problem> {
+    let asked = match method.as_str() {
+        "HEAD" => "GET",
+        other => other,
+    };
+    let at_path: Vec<_> = ROUTES.iter().filter(|route| route.1 == path).collect();
+    if let Some(route) = at_path.iter().find(|route| route.0 == asked) {
+        return Ok(route.2);
+    }
+    if at_path.is_empty() {
+        tracing::error!(path, "a route without a line in the table of roles");
+        return Err(Problem::new(
+            StatusCode::FORBIDDEN,
+            "closed",
+            "This is open to nobody",
+            "the table of routes and roles does not know this address",
+            "report it: the program forgot to say who may use it",
+        ));
+    }
+    let mut allowed: Vec<&str> = at_path.iter().map(|route| route.0).collect();
+    if allowed.contains(&"GET") {
+        allowed.push("HEAD");
+    }
+    Err(Problem::method(method, allowed.join(",")))
 }
 
 fn not_allowed(who: &Who, least: Role) -> Problem {
@@ -324,6 +349,19 @@ mod tests {
         ] {
             assert_eq!(host_name(host), name);
         }
+    }
+
+    #[test]
+    fn what_does_not_stand_in_the_table_is_closed() {
+        assert_eq!(
+            need(&Method::HEAD, "/api/v1/status").expect("a route"),
+            AtLeast(Operator)
+        );
+        let forgotten = need(&Method::GET, "/api/v1/forgotten").expect_err("closed");
+        assert_eq!(forgotten.status(), StatusCode::FORBIDDEN);
+        let other = need(&Method::DELETE, "/api/v1/status").expect_err("closed");
+        assert_eq!(other.status(), StatusCode::METHOD_NOT_ALLOWED);
+        assert_eq!(other.into_response().headers()["allow"], "GET,HEAD");
     }
 
     #[test]

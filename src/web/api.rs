@@ -12,7 +12,7 @@ use axum::Router;
 use axum::extract::DefaultBodyLimit;
 use axum::http::header;
 use axum::response::IntoResponse;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use utoipa::openapi::path::Operation;
 use utoipa::openapi::security::{ApiKey, ApiKeyValue, HttpAuthScheme, HttpBuilder, SecurityScheme};
 use utoipa::openapi::{
@@ -33,6 +33,25 @@ pub(super) struct Page<T> {
     items: Vec<T>,
     /// What `before` of the next page is; null where this is the last one.
     next: Option<i64>,
+}
+
+/// A whole number that every reader of JSON holds exactly, 0 to 2^53 - 1 (RFC 8259, section 6); others are refused.
+#[derive(Debug, Clone, Copy, Default, Deserialize)]
+#[serde(try_from = "u64")]
+struct Whole(u64);
+
+/// The largest [`Whole`].
+const WHOLE_MAX: u64 = (1 << 53) - 1;
+
+impl TryFrom<u64> for Whole {
+    type Error = String;
+
+    fn try_from(number: u64) -> Result<Self, String> {
+        if number > WHOLE_MAX {
+            return Err(format!("{number}, expected at most {WHOLE_MAX}"));
+        }
+        Ok(Self(number))
+    }
 }
 
 /// How many items a page holds where nothing is said, and at most.

@@ -40,6 +40,9 @@ pub(super) struct Details {
     /// Seconds after which it may be tried again.
     #[serde(skip)]
     retry_after_s: Option<u64>,
+    /// The methods that are answered there, where that is the question.
+    #[serde(skip)]
+    allow: Option<String>,
 }
 
 impl Problem {
@@ -59,6 +62,7 @@ impl Problem {
             what_to_do: what_to_do.into(),
             inspection: None,
             retry_after_s: None,
+            allow: None,
         }))
     }
 
@@ -88,6 +92,29 @@ impl Problem {
             detail,
             "check the address or the number; /api/v1/openapi.json lists what there is",
         )
+    }
+
+    /// The address is there, the method is not; `allowed` are those that are.
+    pub fn method(method: &Method, allowed: String) -> Self {
+        // A method is any token the client likes; only the usual ones are shown back.
+        let shown = match *method {
+            Method::GET
+            | Method::POST
+            | Method::PUT
+            | Method::DELETE
+            | Method::PATCH
+            | Method::HEAD => method.as_str(),
+            _ => "this method",
+        };
+        let mut problem = Self::new(
+            StatusCode::METHOD_NOT_ALLOWED,
+            "method",
+            "This cannot be done with this address",
+            format!("{shown} is not answered here"),
+            "the header Allow says what is",
+        );
+        problem.0.allow = Some(allowed);
+        problem
     }
 
     /// Something that contradicts what is so.
@@ -185,6 +212,10 @@ impl IntoResponse for Problem {
         );
         if let Some(seconds) = self.0.retry_after_s {
             headers.insert(header::RETRY_AFTER, HeaderValue::from(seconds));
+        }
+        let allow = self.0.allow.and_then(|allow| allow.try_into().ok());
+        if let Some(allow) = allow {
+            headers.insert(header::ALLOW, allow);
         }
         if self.0.status == StatusCode::UNAUTHORIZED.as_u16() {
             let bearer = HeaderValue::from_static("Bearer realm=\"acies\"");
@@ -302,25 +333,4 @@ impl<S: Send + Sync, T: DeserializeOwned + Send> FromRequestParts<S> for Place<T
 /// Nothing stands at this address.
 pub(super) async fn unknown() -> Problem {
     Problem::missing("there is nothing at this address")
-}
-
-/// The address is there, the method is not.
-pub(super) async fn method_not_allowed(method: Method) -> Problem {
-    // A method is any token the client likes; only the usual ones are shown back.
-    let shown = match method {
-        Method::GET
-        | Method::POST
-        | Method::PUT
-        | Method::DELETE
-        | Method::PATCH
-        | Method::HEAD => method.to_string(),
-        _ => "this method".to_owned(),
-    };
-    Problem::new(
-        StatusCode::METHOD_NOT_ALLOWED,
-        "method",
-        "This cannot be done with this address",
-        format!("{shown} is not answered here"),
-        "the header Allow says what is",
-    )
 }

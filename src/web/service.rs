@@ -17,7 +17,7 @@ use tower_http::compression::CompressionLayer;
 use tower_http::compression::predicate::{DefaultPredicate, NotForContentType, Predicate};
 
 use super::app::App;
-use super::problem::{method_not_allowed, unknown};
+use super::problem::unknown;
 use super::{access, api, assets, metrics, server};
 use crate::cell::Handle;
 use crate::config::Service;
@@ -67,7 +67,6 @@ fn router(app: App) -> Router {
         .route("/api/v1/openapi.json", get(described))
         .merge(api)
         .fallback(unknown)
-        .method_not_allowed_fallback(method_not_allowed)
         .layer(DefaultBodyLimit::max(BODY_MAX))
         .layer(from_fn_with_state(app.clone(), access::guard))
         .layer(CompressionLayer::new().compress_when(compressed))

@@ -15,11 +15,10 @@ use acies::store::{Phase, Role, SessionKind, Store};
 use acies::web;
 use acies_drivers::link::cable::Cable;
 use acies_simulators::demo_cell::{DemoCell, DemoOptions};
-use acies_simulators::grbl::SimulatedProbe;
-use acies_simulators::open_profile::SimulatedProfiler;
-use acies_simulators::wire::Wire;
 use serde_json::{Value, json};
 use tokio::sync::oneshot;
+
+use super::sockets::{self, Devices};
 
 const FILES: [&str; 3] = ["cell.toml", "recipe.toml", "part.step"];
 
@@ -110,8 +109,8 @@ impl Served {
             let text = fs::read_to_string(configs.join(file)).expect("the demo's files");
             // Fewer profiles than the demo takes: the page is tested here, not the measurement.
             let text = text
-                .replace("encoder_step = 200 ", "encoder_step = 500 ")
-                .replace("encoder_step = 200\n", "encoder_step = 500\n");
+                .replace("encoder_step = 200", "encoder_step = 400")
+                .replace("end_count = 47200", "end_count = 46800");
             fs::write(folder.join(file), text).expect("a copy of them");
         }
         let playing = devices.then(|| play(&folder));
@@ -321,27 +320,11 @@ pub fn measured() -> &'static Served {
     })
 }
 
-/// The cell's devices, playing.
-type Devices = ([SimulatedProfiler; 2], SimulatedProbe);
-
-/// Plays the devices: the profilers in real time, so that there is something to watch, over sockets, which a busy machine serves better
-/// than pseudo-terminals; the probe as fast as it can, since its moves would take half a minute a part.
+/// Plays the devices: the profilers in real time, so that there is something to watch.
 fn play(folder: &Path) -> Devices {
-    let mut demo = DemoCell::with_options(DemoOptions {
+    let demo = DemoCell::with_options(DemoOptions {
         paced: true,
         ..DemoOptions::new(1)
     });
-    let path = folder.join("cell.toml");
-    let mut text = fs::read_to_string(&path).expect("the cell");
-    let mut profiler = |which: usize, port: &str| {
-        let wire = Wire::tcp(SocketAddr::from(([127, 0, 0, 1], 0))).expect("a port");
-        let address = format!("address = {:?}", wire.name());
-        text = text.replace(&format!("port = \"./dev/{port}\""), &address);
-        demo.start_profiler(which, wire).expect("a profiler")
-    };
-    let profilers = [profiler(0, "ttyLEFT"), profiler(1, "ttyRIGHT")];
-    fs::write(&path, text).expect("the cell");
-    demo.options.paced = false;
-    let wire = Wire::pty(&folder.join("dev/ttyPROBE")).expect("a pseudo-terminal");
-    (profilers, demo.start_probe(wire).expect("the probe"))
+    sockets::play(demo, folder)
 }

@@ -2,8 +2,11 @@
 
 use std::collections::BTreeSet;
 
+use acies::store::Role;
 use acies::web;
 use serde_json::Value;
+
+use super::bench::Served;
 
 /// The whole contract in one readable file: a change of it is seen, and made on purpose.
 #[test]
@@ -34,6 +37,41 @@ fn every_reference_in_the_description_leads_somewhere() {
         }
     }
     assert!(seen > 50, "{seen} references");
+}
+
+/// Whoever reads the description knows which numbers are taken; what is beyond them is refused with a reason.
+#[test]
+fn numbers_beyond_those_of_the_description_are_refused() {
+    let cell = Served::without_devices("bounds", |service| {
+        service.anonymous = Some(Role::Administrator);
+    });
+    let document: Value = serde_json::from_str(&web::openapi()).expect("JSON");
+    let mut asked = 0;
+    for (path, item) in document["paths"].as_object().expect("paths") {
+        for parameter in item["get"]["parameters"].as_array().into_iter().flatten() {
+            let schema = &parameter["schema"];
+            if schema["type"] != "integer" {
+                continue;
+            }
+            let name = parameter["name"].as_str().expect("a name");
+            assert_eq!(schema["format"], "int64", "{name} of {path}");
+            let bound =
+                |word: &str, otherwise: i64| i128::from(schema[word].as_i64().unwrap_or(otherwise));
+            let (low, high) = (bound("minimum", i64::MIN), bound("maximum", i64::MAX));
+            for number in [low - 1, high + 1] {
+                let (address, kind) = if parameter["in"] == "path" {
+                    let address = path.replace(&format!("{{{name}}}"), &number.to_string());
+                    (address, "address")
+                } else {
+                    let path = path.replace("{name}", "e1.d1");
+                    (format!("{path}?{name}={number}"), "query")
+                };
+                cell.get(&address).problem(400, kind);
+                asked += 1;
+            }
+        }
+    }
+    assert!(asked >= 20, "{asked} numbers");
 }
 
 fn page() -> std::path::PathBuf {
@@ -72,6 +110,28 @@ fn both_languages_have_the_same_texts_with_the_same_places_to_fill() {
     };
     for key in keys(english) {
         assert_eq!(places(&english[&key]), places(&german[&key]), "{key}");
+    }
+}
+
+/// The words of an enumeration in the report's schema.
+fn words(schema: &Value, name: &str) -> Vec<String> {
+    let cases = schema["$defs"][name]["oneOf"].as_array().expect("cases");
+    let word = |case: &Value| case["const"].as_str().expect("a word").to_owned();
+    cases.iter().map(word).collect()
+}
+
+#[test]
+fn every_reason_of_a_verdict_has_its_sentence_in_both_languages() {
+    let schema = acies::report::Report::json_schema();
+    let reasons = words(&schema, "ReasonCode");
+    let advice = words(&schema, "AdviceCode");
+    assert!(reasons.len() >= 15 && advice.len() >= 8);
+    let texts = texts();
+    let keys = reasons.iter().map(|code| format!("because.{code}"));
+    for key in keys.chain(advice.iter().map(|code| format!("advised.{code}"))) {
+        let [english, german] = ["en", "de"].map(|language| texts[language][&key].as_str());
+        assert!(english.is_some() && german.is_some(), "{key}");
+        assert_ne!(english, german, "{key}");
     }
 }
 

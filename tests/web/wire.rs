@@ -4,7 +4,7 @@ use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::sync::Arc;
 
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::bench::{LONG, Served};
 
@@ -134,6 +134,77 @@ fn slow_clients_are_let_go_and_others_served_meanwhile() {
     // Whether the refusal is still read depends on who closes first; that it ends is what counts.
     let _ = body.read_to_end(&mut answer);
     assert!(started.elapsed() < LONG, "the server ended both");
+}
+
+/// Names, ids and data of the first `count` events after event `last`.
+fn events_after(cell: &Served, last: &str, count: usize) -> Vec<(String, String, Value)> {
+    let mut stream = open(cell);
+    let request = format!(
+        "GET /api/v1/events HTTP/1.1\r\nHost: {}\r\nLast-Event-ID: {last}\r\n\r\n",
+        cell.address
+    );
+    let sent = stream.write_all(request.as_bytes());
+    sent.expect("the server reads");
+    let mut seen = Vec::new();
+    let mut bytes = [0; 4096];
+    // The lines between are heads and lengths of the pieces in which it comes: no event's data ends in the middle of one.
+    while seen.windows(2).filter(|end| end == b"\n\n").count() < count {
+        let read = stream.read(&mut bytes).expect("more events");
+        assert!(read > 0, "{}", String::from_utf8_lossy(&seen));
+        seen.extend_from_slice(&bytes[..read]);
+    }
+    let text = String::from_utf8_lossy(&seen);
+    let line = |event: &str, word: &str| {
+        let found = event.lines().find_map(|line| line.strip_prefix(word));
+        found.unwrap_or_default().to_owned()
+    };
+    let events = text.split("\n\n").take(count).map(|event| {
+        let data = serde_json::from_str(&line(event, "data: ")).expect("JSON");
+        (line(event, "event: "), line(event, "id: "), data)
+    });
+    events.collect()
+}
+
+#[test]
+fn who_comes_back_to_the_events_gets_what_was_missed() {
+    let cell = Served::without_devices("missed", |_| ());
+    cell.wait("a cause", |snapshot| {
+        snapshot.state == acies::cell::State::Error
+    });
+    let before = cell.handle().snapshot();
+    for command in ["halt", "reset", "halt"] {
+        let done = cell.ask("POST", &format!("/api/v1/{command}"), None, &[]);
+        assert_eq!(done.status, 204, "{command}");
+    }
+    let count = (cell.handle().snapshot().sequence - before.sequence) as usize;
+    let last = format!("{}/{}", before.started, before.sequence);
+    let missed = events_after(&cell, &last, count);
+    for (index, (name, id, snapshot)) in missed.iter().enumerate() {
+        let sequence = before.sequence + 1 + index as u64;
+        assert_eq!(name, "snapshot");
+        assert_eq!(id, &format!("{}/{sequence}", before.started));
+        assert_eq!(snapshot["sequence"], sequence);
+    }
+    // Devices that are not there change something now and then too.
+    let mut states: Vec<&Value> = missed.iter().map(|(.., told)| &told["state"]).collect();
+    states.dedup();
+    let back = states.iter().position(|state| *state != "halted");
+    assert_eq!(states[0], "halted", "{states:?}");
+    assert!(back.is_some(), "{states:?}");
+    assert_eq!(states[states.len() - 1], "halted", "{states:?}");
+    let lost = [
+        format!("{}/{}", before.started, u64::MAX),
+        format!("1999-01-01T00:00:00.000Z/{}", before.sequence),
+        "nonsense".to_owned(),
+    ];
+    for last in lost {
+        let [first, second] = events_after(&cell, &last, 2).try_into().expect("two");
+        assert_eq!((first.0.as_str(), first.1.as_str()), ("resync", ""));
+        let reason = first.2["reason"].as_str().expect("a reason");
+        assert!(reason.contains("last event"), "{reason}");
+        assert_eq!(second.0, "snapshot");
+        assert_eq!(second.2["state"], "halted");
+    }
 }
 
 #[test]

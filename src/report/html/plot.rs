@@ -127,7 +127,7 @@ fn spoken(edge: &Edge, characteristic: &Characteristic) -> String {
     format!(
         "Deviation along edge {}: worst, {}. {} of {} stations measured.",
         edge.id,
-        crate::report::conclusion::stated(characteristic),
+        crate::report::wire::Judged::from(characteristic).stated(&characteristic.reason),
         edge.summary.measured,
         edge.summary.stations
     )

@@ -1,6 +1,8 @@
 //! The cell as it is now: status, live events, live points, commands.
 
+use std::collections::VecDeque;
 use std::convert::Infallible;
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::Json;
@@ -8,12 +10,13 @@ use axum::extract::State;
 use axum::http::{HeaderMap, HeaderValue, StatusCode};
 use axum::response::sse::{Event, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
-use futures_util::StreamExt as _;
+use futures_util::{StreamExt as _, stream};
 use serde::Deserialize;
-use tokio_stream::wrappers::WatchStream;
+use tokio::sync::watch;
 use utoipa::IntoParams;
 
-use crate::cell::{Command, DeviceStatus, LiveEdges, LiveProfile, Snapshot};
+use super::Whole;
+use crate::cell::{Command, DeviceStatus, Handle, LiveEdges, LiveProfile, Snapshot};
 use crate::web::access::Who;
 use crate::web::app::{App, blocking};
 use crate::web::problem::{Asked, Problem};
@@ -36,29 +39,93 @@ pub async fn devices(State(app): State<App>) -> Json<Vec<DeviceStatus>> {
 
 /// The cell as it changes: server-sent events named `snapshot`, each with the whole of `/status`.
 ///
-/// The first one comes at once. With `Last-Event-ID` it comes only where something has changed since; between two events the
-/// newest counts, none is owed.
+/// The present one comes at once, then every one that follows. With `Last-Event-ID` those come first that were missed, in order;
+/// where they are no longer kept (the last 512 are), or the daemon was started anew, an event `resync` with the reason comes
+/// instead: what was read before may have changed without a word. A client that does not keep up gets the same.
 #[utoipa::path(get, path = "/api/v1/events", tag = "cell",
     params(("Last-Event-ID" = Option<String>, Header, description = "the last event that was seen")),
     responses((status = 200, description = "events without end", content_type = "text/event-stream", body = String)))]
 pub async fn events(State(app): State<App>, headers: HeaderMap) -> Result<Response, Problem> {
     let place = app.stream_place()?;
-    let seen = headers.get("last-event-id");
-    let mut seen = seen.and_then(|id| id.to_str().ok()).map(str::to_owned);
-    let snapshots = WatchStream::new(app.handle().follow());
-    let events = snapshots.filter_map(move |snapshot| {
+    let follower = Follower::new(app.handle().clone(), headers.get("last-event-id"));
+    let events = stream::unfold(follower, move |mut follower| {
         // A place is held for as long as the stream lives.
         let _ = &place;
-        // A restarted daemon counts anew: its start is part of the name.
-        let id = format!("{}/{}", snapshot.started, snapshot.sequence);
-        let known = seen.take().is_some_and(|seen| seen == id);
-        let event = Event::default().event("snapshot").id(id);
-        let event = (!known).then(|| event.json_data(&*snapshot).ok()).flatten();
-        std::future::ready(event.map(Ok::<_, Infallible>))
+        async move { Some((Ok::<_, Infallible>(follower.next().await?), follower)) }
     });
     let events = events.take_until(async move { app.stopped().await });
     let keep_alive = KeepAlive::new().interval(KEEP_ALIVE).text("alive");
     Ok(Sse::new(events).keep_alive(keep_alive).into_response())
+}
+
+/// One client of the events: what it has seen, and what it is still owed.
+struct Follower {
+    handle: Handle,
+    newest: watch::Receiver<Arc<Snapshot>>,
+    /// The number of the event that was sent last.
+    seen: u64,
+    owed: VecDeque<Event>,
+}
+
+impl Follower {
+    /// For a client that has seen event `last`, or none.
+    fn new(handle: Handle, last: Option<&HeaderValue>) -> Self {
+        let mut newest = handle.follow();
+        let now = newest.borrow_and_update().clone();
+        let mut follower = Self {
+            handle,
+            newest,
+            seen: now.sequence,
+            owed: VecDeque::new(),
+        };
+        let Some(last) = last else {
+            follower.owe(&now);
+            return follower;
+        };
+        // A restarted daemon counts anew: its start is part of the name.
+        let last = last.to_str().ok().and_then(|last| last.rsplit_once('/'));
+        let last = last.filter(|(started, _)| *started == now.started);
+        match last.and_then(|(_, sequence)| sequence.parse().ok()) {
+            Some(sequence) => follower.catch_up(sequence, &now),
+            None => follower.resync("the daemon was started since the last event", &now),
+        }
+        follower
+    }
+
+    async fn next(&mut self) -> Option<Event> {
+        while self.owed.is_empty() {
+            // An error means that the daemon has ended.
+            self.newest.changed().await.ok()?;
+            let now = self.newest.borrow_and_update().clone();
+            self.catch_up(self.seen, &now);
+        }
+        self.owed.pop_front()
+    }
+
+    /// Owes everything after event `sequence`.
+    fn catch_up(&mut self, sequence: u64, now: &Snapshot) {
+        match self.handle.since(sequence) {
+            Some(missed) => {
+                self.seen = sequence;
+                missed.iter().for_each(|snapshot| self.owe(snapshot));
+            }
+            None => self.resync("what followed the last event is no longer kept", now),
+        }
+    }
+
+    fn resync(&mut self, reason: &str, now: &Snapshot) {
+        let event = Event::default().event("resync");
+        let reason = serde_json::json!({ "reason": reason });
+        self.owed.extend(event.json_data(reason).ok());
+        self.owe(now);
+    }
+
+    fn owe(&mut self, snapshot: &Snapshot) {
+        let id = format!("{}/{}", snapshot.started, snapshot.sequence);
+        let event = Event::default().event("snapshot").id(id);
+        self.owed.extend(event.json_data(snapshot).ok());
+        self.seen = snapshot.sequence;
+    }
 }
 
 /// Which of the live points are wanted.
@@ -67,9 +134,11 @@ pub async fn events(State(app): State<App>, headers: HeaderMap) -> Result<Respon
 #[serde(default)]
 pub struct From {
     /// The generation that is there already: header `Acies-Generation` of the last answer.
-    generation: u64,
+    #[param(value_type = i64, minimum = 0, maximum = 9_007_199_254_740_991_i64)]
+    generation: Whole,
     /// How many points of it are there already.
-    from: usize,
+    #[param(value_type = i64, minimum = 0, maximum = 9_007_199_254_740_991_i64)]
+    from: Whole,
 }
 
 /// The points of the scan that runs, or ran last: x, y, z in mm as 32-bit floats, least significant byte first.
@@ -80,7 +149,8 @@ pub struct From {
         headers(("Acies-Inspection" = i64, description = "the inspection"), ("Acies-Generation" = u64, description = "the generation"),
                 ("Acies-From" = u64, description = "index of the first point")))))]
 pub async fn live_points(State(app): State<App>, Asked(asked): Asked<From>) -> Response {
-    let live = app.handle().live().points(asked.generation, asked.from);
+    let from = usize::try_from(asked.from.0).unwrap_or(usize::MAX);
+    let live = app.handle().live().points(asked.generation.0, from);
     let mut body = Vec::with_capacity(live.points.len() * 12);
     for number in live.points.iter().flatten() {
         body.extend_from_slice(&number.to_le_bytes());
@@ -108,7 +178,8 @@ pub struct Known {
     /// The inspection of the last answer.
     inspection: i64,
     /// Its number.
-    number: u64,
+    #[param(value_type = i64, minimum = 0, maximum = 9_007_199_254_740_991_i64)]
+    number: Whole,
 }
 
 /// The edges of the part that is being scanned, or was scanned last, as they are measured so far. Nothing is judged before the end.
@@ -118,7 +189,7 @@ pub struct Known {
     responses((status = 200, description = "the edges, if they have been measured since", body = LiveEdges)))]
 pub async fn live_edges(State(app): State<App>, Asked(known): Asked<Known>) -> Json<LiveEdges> {
     let live = app.handle().live();
-    Json(live.edges(known.inspection, known.number))
+    Json(live.edges(known.inspection, known.number.0))
 }
 
 /// End regularly: the part under way is finished, those that wait are not begun.

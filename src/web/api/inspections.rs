@@ -15,11 +15,10 @@ use tokio_stream::wrappers::ReceiverStream;
 use utoipa::{IntoParams, ToSchema};
 
 use super::{Page, bytes, file};
-use crate::acquire::Assembler;
 use crate::cell::Mode;
-use crate::points::{PointCloud, write};
+use crate::points::write;
 use crate::report::{Report, content_security_policy};
-use crate::store::{Export, History, Inspection, Order, ScanReader, Store};
+use crate::store::{Export, History, Inspection, Order, ScanFileError, ScanReader, Store};
 use crate::web::access::Who;
 use crate::web::app::{App, blocking};
 use crate::web::problem::{Asked, Input, Place, Problem, chain};
@@ -228,21 +227,12 @@ pub async fn scan_ply(State(app): State<App>, Place(id): Place<i64>) -> Result<R
 fn assembled(store: &Store, id: i64) -> Result<Vec<u8>, Problem> {
     let path = store.scan_path(id)?;
     let fault = |error: &dyn std::error::Error| Problem::fault(chain(error));
-    let mut reader = ScanReader::open(&path).map_err(|error| fault(&error))?;
-    let mut views: Vec<Assembler> = reader
-        .views()
-        .iter()
-        .map(|view| Assembler::new(&view.device, view.calibration))
-        .collect();
-    while let Some((view, profiles)) = reader.profiles().map_err(|error| fault(&error))? {
-        for profile in &profiles {
-            if let Some(view) = views.get_mut(view) {
-                view.push(profile);
-            }
-        }
-    }
-    let clouds: Vec<PointCloud> = views.into_iter().map(|view| view.finish().0).collect();
-    let cloud = PointCloud::merge(&clouds).map_err(|error| fault(&error))?;
+    let cloud = ScanReader::open(&path)
+        .and_then(ScanReader::into_cloud)
+        .map_err(|error| match error {
+            ScanFileError::Carried { .. } => Problem::missing(chain(&error)),
+            _ => fault(&error),
+        })?;
     write::scan_bytes(&cloud, write::Encoding::LittleEndian).map_err(|error| fault(&error))
 }
 

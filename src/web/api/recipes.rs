@@ -13,9 +13,9 @@ use serde::{Deserialize, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::file as as_file;
-use crate::cell::{CellError, Handle, check_recipe};
+use crate::cell::{CellError, Handle, check_recipe, judge_alike};
 use crate::nominal::Nominal;
-use crate::store::{NewRecipe, RecipeContent, RecipeVersion, Store};
+use crate::store::{NewRecipe, RecipeContent, RecipeVersion, Role, Store};
 use crate::web::access::Who;
 use crate::web::app::App;
 use crate::web::password::secret;
@@ -214,6 +214,9 @@ pub struct Activation {
 }
 
 /// Judge parts by this version from the next one on.
+///
+/// A setter may do so where it was in force before or judges as the one in force does; what changes the judgement is put in force
+/// by a metrologist.
 #[utoipa::path(post, path = "/api/v1/recipes/{id}/activate", tag = "recipes", params(("id" = i64, Path)), request_body = Activation,
     responses((status = 200, description = "active", body = RecipeVersion)))]
 pub async fn activate(
@@ -223,8 +226,35 @@ pub async fn activate(
     Input(Activation { why }): Input<Activation>,
 ) -> Result<Json<RecipeVersion>, Problem> {
     reason(&why)?;
-    let version = app.heavy(move |handle| handle.activate_recipe(id, &who.name, why.trim()));
+    let version = app.heavy(move |handle| {
+        if who.role < Some(Role::Metrologist) {
+            was_released(handle.store(), id)?;
+        }
+        Ok::<_, Problem>(handle.activate_recipe(id, &who.name, why.trim())?)
+    });
     Ok(Json(version.await?))
+}
+
+/// What a part is accepted by is a matter of who answers for the measurement, not of who sets the line up: ISO 14253-1 wants a
+/// decision rule that is stated, ISO 10012 (5.1) a metrological function that answers for it, ISO 9001 (8.5.6) changes that are
+/// authorised and kept. So a metrologist puts limits in force; a setter goes back and forth between what was in force, and may
+/// change what judges nothing.
+fn was_released(store: &Store, id: i64) -> Result<(), Problem> {
+    let wanted = store.recipe(id)?;
+    let alike = match store.active_recipe()? {
+        Some(active) => judge_alike(&wanted, &active)?,
+        None => false,
+    };
+    if wanted.version.released || alike {
+        return Ok(());
+    }
+    Err(Problem::new(
+        StatusCode::FORBIDDEN,
+        "release",
+        "This recipe has not been released",
+        "its nominal, limits, decision rule, datums or uncertainties are others than those in force",
+        "ask somebody who is metrologist or above to activate it; after that a setter may",
+    ))
 }
 
 fn reason(why: &str) -> Result<(), Problem> {

@@ -49,3 +49,37 @@ export function valued(found) {
   const spread = found.u === null ? "" : ` ± ${number(2 * found.u, places)}`;
   return `${signed(found.value, places)}${spread}${unit}`;
 }
+
+/** Why a verdict is what it is, in the page's language; `found` is an inspection or a report. What an older version wrote stays English. */
+export function because(found) {
+  const why = found.because;
+  if (!why) return found.reason;
+  const judged = why.characteristic;
+  const values = {
+    edge: why.edge,
+    names: listed(why.names),
+    count: why.count,
+    share: Math.round((why.coverage ?? 0) * 100),
+    detail: why.detail ? t("because.detail", { detail: why.detail }) : "",
+    others: why.count === 0 ? "" : t(why.count === 1 ? "because.other" : "because.others", { count: why.count }),
+  };
+  if (judged) {
+    const place = judged.s_mm === null ? "" : t("because.place", { s: number(judged.s_mm, 1) });
+    values.said = judged.value === null
+      ? t("because.unmeasured", { quantity: word("quantity", judged.quantity) })
+      : t("because.stated", { quantity: word("quantity", judged.quantity), value: valued(judged), place });
+    values.limits = limits(judged);
+  }
+  return t(`because.${why.code}`, values);
+}
+
+/** What to do next, in the page's language. */
+export function advised(found) {
+  return found.because ? t(`advised.${found.because.advice}`) : found.advice;
+}
+
+/** At most five of them, then a count. */
+function listed(names) {
+  const shown = names.slice(0, 5).join(", ");
+  return names.length > 5 ? t("because.more", { names: shown, count: names.length - 5 }) : shown;
+}

@@ -3,7 +3,7 @@
 import { get, query } from "../api.js";
 import { fill, h, table } from "../dom.js";
 import { t, time, word } from "../text.js";
-import { badge, outcome } from "../verdict.js";
+import { badge, because, outcome } from "../verdict.js";
 
 export function history(view, page) {
   const serial = h("input", { name: "part_serial", id: "find-serial", type: "search", autocomplete: "off" });
@@ -32,7 +32,7 @@ export function history(view, page) {
       const found = await get(`/inspections${query({ ...asked(), before: ends.at(-1), limit: 25 })}`);
       const rows = found.items.map((one) => ({
         go: `#/inspection/${one.id}`,
-        cells: [h("a", { href: `#/inspection/${one.id}` }, `#${one.id}`), badge(outcome(one)), one.part_serial, one.order_number, time(one.requested), word("purpose", one.purpose), one.operator, one.reason],
+        cells: [h("a", { href: `#/inspection/${one.id}` }, `#${one.id}`), badge(outcome(one)), one.part_serial, one.order_number, time(one.requested), word("purpose", one.purpose), one.operator, because(one)],
       }));
       const heads = ["id", "verdict", "serial", "order", "requested", "purpose", "operator", "reason"].map((name) => t(`column.${name}`));
       fill(list, rows.length ? table(heads, rows) : h("p", {}, t("nothing.found")),

@@ -3,7 +3,7 @@
 import { get } from "../api.js";
 import { fill, h, table } from "../dom.js";
 import { bytes, count, number, t, time, word } from "../text.js";
-import { badge, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
+import { advised, badge, because, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
 
 export function inspection(view, page, [id]) {
   let shown = null;
@@ -35,7 +35,7 @@ export function inspection(view, page, [id]) {
     fill(view,
       h("section.board.slim", { "data-verdict": value },
         h("p.big", {}, h("span.sign", { "aria-hidden": "true" }, SIGNS[value] ?? "…"), h("span", { id: "verdict" }, word("verdict.big", value))),
-        h("p.part", {}, `#${found.id} · ${found.part_serial}`), h("p.reason", { id: "reason" }, found.reason)),
+        h("p.part", {}, `#${found.id} · ${found.part_serial}`), h("p.reason", { id: "reason" }, because(found))),
       h("section.card", {},
         h("dl.facts", {}, facts.map(([name, fact]) => h("div", {}, h("dt", {}, t(`fact.${name}`)), h("dd", {}, fact)))),
         h("div.row", {}, done ? [link("report.json", "JSON"), link("report.csv", "CSV"), link("report.html", "HTML")] : null,
@@ -47,7 +47,7 @@ export function inspection(view, page, [id]) {
     const report = await get(`/inspections/${found.id}/report.json`);
     const judged = worstFirst(report);
     const rows = judged.slice(0, 40).map((one) => ({ cells: [badge(one.verdict), one.edge, word("quantity", one.quantity), valued(one), limits(one), one.reason] }));
-    fill(worst, h("h2", {}, t("worst.first")), report.advice ? h("p", {}, report.advice) : null,
+    fill(worst, h("h2", {}, t("worst.first")), report.advice ? h("p", {}, advised(report)) : null,
       table(["verdict", "edge", "quantity", "value", "limits", "reason"].map((name) => t(`column.${name}`)), rows, [3, 4]),
       judged.length > 40 ? h("p.note", {}, t("more.in.report", { count: judged.length - 40 })) : null,
       report.findings.length ? [h("h3", {}, t("findings")), h("ul", {}, report.findings.map((finding) => h("li", {}, finding)))] : null);

@@ -4,7 +4,7 @@ import { get, post, start } from "../api.js";
 import { fill, h, say } from "../dom.js";
 import { livePictures } from "../live.js";
 import { t, time, word } from "../text.js";
-import { badge, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
+import { advised, badge, because, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
 
 /** Lines of the short table; the whole one is a click away. */
 const WORST = 6;
@@ -121,7 +121,7 @@ export function measure(view, page) {
     say(sign, SIGNS[value] ?? "");
     say(big, word("verdict.big", value));
     say(part, last.part_serial);
-    say(reason, last.reason);
+    say(reason, because(last));
     say(advice, time(last.ended));
   }
 
@@ -136,7 +136,7 @@ export function measure(view, page) {
       const worst = worstFirst(report).filter((found) => found.verdict !== "undefined").slice(0, WORST);
       fill(result,
         h("h2", {}, t("result.of", { part: last.part_serial })),
-        report.advice ? h("p", {}, report.advice) : null,
+        report.advice ? h("p", {}, advised(report)) : null,
         h("ul.worst", {}, worst.map((found) => h("li", {}, badge(found.verdict),
           h("strong", {}, found.edge), h("span", {}, word("quantity", found.quantity)),
           h("span.number", {}, valued(found)), h("span.note", {}, t("limits.are", { limits: limits(found) }))))),
