@@ -76,7 +76,6 @@ pub struct Uncertainty {
     /// Most trials of an edge break.
     pub break_trials: Option<usize>,
     /// Trials of form, corners and gaps.
-    #[serde(default)]
     pub derived_trials: Option<usize>,
     /// Seed of the trials.
     pub seed: Option<u64>,
