@@ -789,11 +789,23 @@ fn the_command_finds_the_lag_of_simulated_devices() {
     let now = Instant::now();
     tool.go(now);
     seen.go(now);
-    let run = std::process::Command::new(env!("CARGO_BIN_EXE_acies"))
-        .args(["calibrate", "--lag", "2", "--radius", "20", "--json"])
-        .arg(&cell)
-        .output()
-        .expect("the program");
+    let asked = || {
+        std::process::Command::new(env!("CARGO_BIN_EXE_acies"))
+            .args(["calibrate", "--lag", "2", "--radius", "20", "--json"])
+            .arg(&cell)
+            .output()
+            .expect("the program")
+    };
+    // Everything goes by the clock: where this machine is busy otherwise the program says that the lag stays open, and is asked again.
+    let open = |run: &std::process::Output| {
+        String::from_utf8_lossy(&run.stderr).contains("the lag stays open")
+    };
+    let mut run = asked();
+    for _ in 0..2 {
+        if open(&run) {
+            run = asked();
+        }
+    }
     let told = String::from_utf8_lossy(&run.stderr);
     assert!(run.status.success(), "{told}");
     assert!(
