@@ -9,7 +9,7 @@ use acies::mesh::{
 };
 use acies::points::{Neighbors, Unit, read};
 use acies::surface::{plane_normals, weighted_plane_normals};
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use proptest::prelude::*;
 
 #[path = "mesh/bodies.rs"]
@@ -17,7 +17,7 @@ mod bodies;
 mod clouds;
 
 use clouds::score::cloud;
-use clouds::solids;
+use clouds::solids::{self, Hole, extrusion};
 
 /// The triangulation, checked.
 fn triangulated(points: &[DVec3]) -> Delaunay {
@@ -489,20 +489,70 @@ fn sharp_edges_of_the_fandisk_are_edges_of_the_mesh() {
     let Some(points) = data("models/fandisk.obj") else {
         return;
     };
-    let made = mesh(&points, Settings::default()).expect("a body");
-    assert!(made.topology.is_watertight() && made.topology.is_manifold());
-    assert_eq!(made.matched_percent(), 100.0);
-    let sharp = clouds::fandisk::sharp_edges(25.0);
-    let edges: std::collections::HashSet<(u32, u32)> = (made.triangles.iter())
-        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
+    let made = closed("fandisk", &points, 0);
+    let (found, all) = kept(&made, &clouds::fandisk::sharp_edges(25.0));
+    assert!(found as f64 >= 0.995 * all as f64, "{found} of {all}");
+}
+
+#[test]
+fn a_part_with_few_points_on_flat_faces_has_its_three_holes() {
+    let Some(sampled) = clouds::models::labelled("mechpart.recon.m") else {
+        return;
+    };
+    let made = closed("mechpart", &sampled.points, 3);
+    let place = |p: DVec3| {
+        sampled
+            .points
+            .iter()
+            .position(|q| *q == p)
+            .map(|i| i as u32)
+    };
+    let ends = |line: &clouds::Line| match line {
+        clouds::Line::Segment(a, b) => Some((place(*a)?, place(*b)?)),
+        _ => None,
+    };
+    let sharp: Vec<(u32, u32)> = (sampled.edges.iter())
+        .filter_map(ends)
         .map(|(a, b)| (a.min(b), a.max(b)))
         .collect();
-    let found = sharp.iter().filter(|e| edges.contains(e)).count();
-    assert!(
-        found as f64 >= 0.995 * sharp.len() as f64,
-        "{found} of {}",
-        sharp.len()
-    );
+    let (found, all) = kept(&made, &sharp);
+    assert_eq!(all, 904);
+    assert!(found as f64 >= 0.99 * all as f64, "{found} of {all}");
+}
+
+/// How many of the edges are edges of the mesh, and how many there are.
+fn kept(made: &Mesh, wanted: &[(u32, u32)]) -> (usize, usize) {
+    let edges: std::collections::HashSet<(u32, u32)> = (made.triangles.iter())
+        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
+        .map(|(a, b)| (made.sources[a as usize], made.sources[b as usize]))
+        .map(|(a, b)| (a.min(b), a.max(b)))
+        .collect();
+    let found = wanted.iter().filter(|e| edges.contains(e)).count();
+    (found, wanted.len())
+}
+
+#[test]
+fn small_through_holes_stay_open() {
+    let profile = [(0.0, 0.0), (40.0, 0.0), (40.0, 4.0), (0.0, 4.0)].map(|(x, z)| DVec2::new(x, z));
+    for (i, radius) in [0.9, 1.2, 1.6, 2.0].into_iter().enumerate() {
+        let hole = Hole {
+            centre: DVec2::new(20.0, 10.0),
+            radius,
+            top: 4.0,
+            bottom: 0.0,
+            blind: false,
+        };
+        let clean = extrusion(&profile, 20.0, &[hole]).even(4_000 + 101 * i, 400 + 7 * i);
+        let around = std::f64::consts::TAU * radius / clean.spacing;
+        assert!(around > 8.0, "{around} spacings around");
+        let noise = 0.1 * clean.spacing;
+        closed(&format!("{radius}, exact"), &clean.points, 1);
+        closed(
+            &format!("{radius}, noise"),
+            &clean.shaken(noise, 5).points,
+            1,
+        );
+    }
 }
 
 fn acies(arguments: &[&str]) -> (i32, String, String) {
