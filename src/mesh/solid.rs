@@ -312,6 +312,20 @@ pub fn settle(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut S
         }
         part(delaunay, facets, &scales, solid, (&group, &node));
     }
+    // A body thinner than its spacing is cheapest where it is not at all: there the votes hold.
+    let inside = &solid.inside;
+    let is_passed = |v: u32| {
+        let mut cells = stars.of(v).iter().map(|code| inside[(code >> 2) as usize]);
+        let first = cells.next();
+        cells.all(|c| Some(c) == first)
+    };
+    let count = delaunay.points.len() as u32;
+    let passed: Vec<bool> = (0..count).into_par_iter().map(is_passed).collect();
+    for (cell, corners) in delaunay.cells.iter().enumerate() {
+        if !corners.contains(&GHOST) && corners.iter().all(|v| passed[*v as usize]) {
+            solid.inside[cell] = solid.votes[cell] > 0;
+        }
+    }
 }
 
 /// Parts one group of free cells, each with its node.
