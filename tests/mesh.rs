@@ -169,7 +169,7 @@ fn repeated_points_count_once_and_flat_sets_are_refused() {
     assert_eq!(refused(&plane), flat(100, 2));
     assert_eq!(
         refused(&plane).to_string(),
-        "points: 100 distinct ones, all in one plane, expected a body in space"
+        "points: 100 distinct ones, all in one plane, expected a body in space; scan further sides of the part"
     );
     assert_eq!(
         refused(&[DVec3::ONE, DVec3::NAN]),

@@ -92,8 +92,15 @@ impl Mesh {
         }
         if made.mending.after > 0 && !self.open {
             findings.push(format!(
-                "around {} vertices the surface is no manifold or misses them: too noisy or too sparse there",
+                "around {} vertices the surface is no manifold or misses them: too noisy or too sparse there, or seen from one side only, which \
+                 --open is for",
                 made.mending.after
+            ));
+        }
+        if topology.pieces > 1 && !self.open {
+            findings.push(format!(
+                "{} closed pieces: bodies apart or voids, points far from all others, or walls thinner than the spacing of points",
+                topology.pieces
             ));
         }
         let summary = Summary {
