@@ -297,6 +297,41 @@ fn faces_of_a_cube_are_flat_and_its_edges_sharp() {
 }
 
 #[test]
+fn scale_place_and_bodies_apart_or_within_change_nothing() {
+    let sphere = bodies::ellipsoid(2_000, DVec3::ONE * 10.0).points;
+    let with =
+        |scale: f64, at: DVec3| -> Vec<DVec3> { sphere.iter().map(|p| *p * scale + at).collect() };
+    // A thousandth of a millimetre in all; a kilometre away.
+    closed("tiny", &with(1e-4, DVec3::ZERO), 0);
+    closed("far", &with(1.0, DVec3::new(1e6, 1e6, -1e6)), 0);
+    for (name, second) in [
+        ("apart", with(1.0, DVec3::X * 40.0)),
+        ("beside, a spacing between", with(1.0, DVec3::X * 20.7)),
+        ("within, a void", with(0.5, DVec3::ZERO)),
+    ] {
+        let mut both = sphere.clone();
+        both.extend(second);
+        let made = mesh(&both, Settings::default()).expect("bodies");
+        let t = made.topology;
+        assert!(t.is_watertight() && t.is_manifold(), "{name}: {t:?}");
+        assert_eq!(
+            (t.pieces, t.genus(), made.delta_f()),
+            (2, Some(0), 0),
+            "{name}"
+        );
+        // A void counts negative: its triangles look into it.
+        let whole = 4.0 / 3.0 * std::f64::consts::PI * 1000.0;
+        let expected = if name.starts_with("within") {
+            0.875
+        } else {
+            2.0
+        } * whole;
+        let share = volume(&made) / expected;
+        assert!((0.98..1.0).contains(&share), "{name}: {share}");
+    }
+}
+
+#[test]
 fn noise_and_random_samples_are_closed_too() {
     closed("block", &solids::block().sample(20_000, 0.1, 1).points, 2);
     let clean = solids::cube_with_hole(10.0).even(6_000, 500);
@@ -646,4 +681,19 @@ fn the_program_meshes_writes_and_refuses() {
         assert_eq!(acies(&[command, &at("absent.xyz")]).0, 74);
     }
     assert_eq!(topology(0, &[]).vertices, 0);
+
+    // Points that are no part of the surface are in the mesh, and told.
+    let mut sphere = bodies::ellipsoid(2_000, DVec3::ONE * 10.0).points;
+    sphere.extend((0..20).map(|i| DVec3::new(30.0 + 7.0 * f64::from(i), f64::from(i % 3), 1.0)));
+    let lines: Vec<String> = sphere
+        .iter()
+        .map(|p| format!("{} {} {}", p.x, p.y, p.z))
+        .collect();
+    std::fs::write(at("outliers.xyz"), lines.join("\n")).expect("a scan");
+    let (status, said, wrong) = acies(&["mesh", &at("outliers.xyz")]);
+    assert_eq!(status, 0, "{wrong}");
+    assert!(
+        said.contains("note: 20 points lie more than") && said.contains("remove them first"),
+        "{said}"
+    );
 }
