@@ -336,8 +336,9 @@ fn part(
     solid: &mut Solid,
     (group, node): (&[u32], &[u32]),
 ) {
-    /// What a vote costs against a facet of one and a half times the usual radius.
+    /// What one of the eight votes costs, where a facet of one and a half times the usual radius costs 1: half the votes of one matched corner.
     const VOTE: f64 = 0.25;
+    /// Share of the usual radius that costs nothing.
     const FREE: f64 = 0.5;
     /// Of three points on a line the radius is infinite.
     const MOST: f64 = 1e6;
