@@ -572,17 +572,15 @@ fn open_row(
         total += 0.5 * (b - a).cross(c - a).length();
         let n = (b - a).cross(c - a).normalize_or_zero();
         let centre = (a + b + c) / 3.0;
+        // From so near that a ray into a hole meets its wall on this side.
+        let reach = 0.5 * across;
         let is_near = |way: DVec3| {
-            let hit = |f: &clouds::Face| f.hit(centre + way * 100.0, -way);
-            let off = |(t, _): (f64, DVec3)| (t - 100.0).abs();
-            solid
-                .faces
-                .iter()
-                .filter_map(hit)
-                .map(off)
-                .any(|d| d < 0.5 * across)
+            let from = centre - way * reach;
+            let mut hits = solid.faces.iter().filter_map(|f| f.hit(from, way));
+            hits.any(|(t, _)| t < 2.0 * reach)
         };
-        off += usize::from(!is_near(n) && !is_near(views[0]));
+        let ways = [n, DVec3::X, DVec3::Y, DVec3::Z];
+        off += usize::from(!ways.iter().any(|way| is_near(*way)));
         for v in &triangle[1..] {
             let (i, j) = (root(&mut parent, triangle[0]), root(&mut parent, *v));
             parent[i.max(j) as usize] = i.min(j);

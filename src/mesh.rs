@@ -1,15 +1,16 @@
 //! Watertight meshes through every point, and the normals they give.
 //!
 //! The way of Ma 2011: the Delaunay triangulation of the points; around every point an umbrella of its facets; umbrellas picked again until
-//! neighbours pick the same. What does not come to match is decided by the cells: every umbrella votes which of its cells are inside, and
-//! cells are turned until the surface between inside and outside is a manifold through every point.
+//! neighbours pick the same. What does not come to match is decided by the cells: every umbrella votes which of its cells are inside, the
+//! cheapest parting of all cells follows the votes without wide facets, and cells are turned until the surface between inside and outside is a
+//! manifold through every point.
 
 mod build;
 pub mod check;
 mod cone;
 mod curve;
+mod cut;
 pub mod delaunay;
-mod handles;
 pub mod mend;
 pub mod normals;
 mod open;
@@ -144,7 +145,7 @@ impl Body {
         let matching = match_umbrellas(&delaunay, &stars, &facets, settings.cone);
         lap("umbrellas");
         let mut solid = vote(&delaunay, &stars, &facets);
-        settle(&delaunay, &facets, &mut solid);
+        settle(&delaunay, &stars, &facets, &mut solid);
         lap("inside");
         // What closes an open scan is thrown away again: cells as large as the part, at vertices of thousands.
         let mending = mend(&delaunay, &stars, &facets, &mut solid, !settings.open);

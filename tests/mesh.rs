@@ -9,7 +9,7 @@ use acies::mesh::{
 };
 use acies::points::{Neighbors, Unit, read};
 use acies::surface::{plane_normals, weighted_plane_normals};
-use glam::DVec3;
+use glam::{DVec2, DVec3};
 use proptest::prelude::*;
 
 #[path = "mesh/bodies.rs"]
@@ -17,7 +17,7 @@ mod bodies;
 mod clouds;
 
 use clouds::score::cloud;
-use clouds::solids;
+use clouds::solids::{self, Hole, extrusion};
 
 /// The triangulation, checked.
 fn triangulated(points: &[DVec3]) -> Delaunay {
@@ -169,7 +169,7 @@ fn repeated_points_count_once_and_flat_sets_are_refused() {
     assert_eq!(refused(&plane), flat(100, 2));
     assert_eq!(
         refused(&plane).to_string(),
-        "points: 100 distinct ones, all in one plane, expected a body in space"
+        "points: 100 distinct ones, all in one plane, expected a body in space; scan further sides of the part"
     );
     assert_eq!(
         refused(&[DVec3::ONE, DVec3::NAN]),
@@ -294,6 +294,41 @@ fn faces_of_a_cube_are_flat_and_its_edges_sharp() {
     // At the eight corners, and where a point of a face lies too near an edge for its link to be Delaunay, a triangle lies on no face.
     let off = off.count();
     assert!(off <= 3 * 8, "{off} triangles off the faces");
+}
+
+#[test]
+fn scale_place_and_bodies_apart_or_within_change_nothing() {
+    let sphere = bodies::ellipsoid(2_000, DVec3::ONE * 10.0).points;
+    let with =
+        |scale: f64, at: DVec3| -> Vec<DVec3> { sphere.iter().map(|p| *p * scale + at).collect() };
+    // A thousandth of a millimetre in all; a kilometre away.
+    closed("tiny", &with(1e-4, DVec3::ZERO), 0);
+    closed("far", &with(1.0, DVec3::new(1e6, 1e6, -1e6)), 0);
+    for (name, second) in [
+        ("apart", with(1.0, DVec3::X * 40.0)),
+        ("beside, a spacing between", with(1.0, DVec3::X * 20.7)),
+        ("within, a void", with(0.5, DVec3::ZERO)),
+    ] {
+        let mut both = sphere.clone();
+        both.extend(second);
+        let made = mesh(&both, Settings::default()).expect("bodies");
+        let t = made.topology;
+        assert!(t.is_watertight() && t.is_manifold(), "{name}: {t:?}");
+        assert_eq!(
+            (t.pieces, t.genus(), made.delta_f()),
+            (2, Some(0), 0),
+            "{name}"
+        );
+        // A void counts negative: its triangles look into it.
+        let whole = 4.0 / 3.0 * std::f64::consts::PI * 1000.0;
+        let expected = if name.starts_with("within") {
+            0.875
+        } else {
+            2.0
+        } * whole;
+        let share = volume(&made) / expected;
+        assert!((0.98..1.0).contains(&share), "{name}: {share}");
+    }
 }
 
 #[test]
@@ -489,20 +524,73 @@ fn sharp_edges_of_the_fandisk_are_edges_of_the_mesh() {
     let Some(points) = data("models/fandisk.obj") else {
         return;
     };
-    let made = mesh(&points, Settings::default()).expect("a body");
-    assert!(made.topology.is_watertight() && made.topology.is_manifold());
-    assert_eq!(made.matched_percent(), 100.0);
-    let sharp = clouds::fandisk::sharp_edges(25.0);
-    let edges: std::collections::HashSet<(u32, u32)> = (made.triangles.iter())
-        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
+    let made = closed("fandisk", &points, 0);
+    let (found, all) = kept(&made, &clouds::fandisk::sharp_edges(25.0));
+    assert!(found as f64 >= 0.995 * all as f64, "{found} of {all}");
+}
+
+#[test]
+fn a_part_with_few_points_on_flat_faces_has_its_three_holes() {
+    let Some(sampled) = clouds::models::labelled("mechpart.recon.m") else {
+        return;
+    };
+    let made = closed("mechpart", &sampled.points, 3);
+    let place = |p: DVec3| {
+        sampled
+            .points
+            .iter()
+            .position(|q| *q == p)
+            .map(|i| i as u32)
+    };
+    let ends = |line: &clouds::Line| match line {
+        clouds::Line::Segment(a, b) => Some((place(*a)?, place(*b)?)),
+        _ => None,
+    };
+    let sharp: Vec<(u32, u32)> = (sampled.edges.iter())
+        .filter_map(ends)
         .map(|(a, b)| (a.min(b), a.max(b)))
         .collect();
-    let found = sharp.iter().filter(|e| edges.contains(e)).count();
-    assert!(
-        found as f64 >= 0.995 * sharp.len() as f64,
-        "{found} of {}",
-        sharp.len()
-    );
+    let (found, all) = kept(&made, &sharp);
+    assert_eq!(all, 904);
+    assert!(found as f64 >= 0.99 * all as f64, "{found} of {all}");
+}
+
+/// How many of the edges are edges of the mesh, and how many there are.
+fn kept(made: &Mesh, wanted: &[(u32, u32)]) -> (usize, usize) {
+    let edges: std::collections::HashSet<(u32, u32)> = (made.triangles.iter())
+        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
+        .map(|(a, b)| (made.sources[a as usize], made.sources[b as usize]))
+        .map(|(a, b)| (a.min(b), a.max(b)))
+        .collect();
+    let found = wanted.iter().filter(|e| edges.contains(e)).count();
+    (found, wanted.len())
+}
+
+#[test]
+fn small_through_holes_stay_open() {
+    let profile = [(0.0, 0.0), (40.0, 0.0), (40.0, 4.0), (0.0, 4.0)].map(|(x, z)| DVec2::new(x, z));
+    for (i, radius) in [0.9, 1.2, 1.6, 2.0].into_iter().enumerate() {
+        let hole = Hole {
+            centre: DVec2::new(20.0, 10.0),
+            radius,
+            top: 4.0,
+            bottom: 0.0,
+            blind: false,
+        };
+        let clean = extrusion(&profile, 20.0, &[hole]).even(4_000 + 101 * i, 400 + 7 * i);
+        let around = std::f64::consts::TAU * radius / clean.spacing;
+        assert!(
+            around < 8.0 * 1.4f64.powi(i as i32),
+            "{around} spacings around"
+        );
+        let noise = 0.1 * clean.spacing;
+        closed(&format!("{radius}, exact"), &clean.points, 1);
+        closed(
+            &format!("{radius}, noise"),
+            &clean.shaken(noise, 5).points,
+            1,
+        );
+    }
 }
 
 fn acies(arguments: &[&str]) -> (i32, String, String) {
@@ -596,4 +684,19 @@ fn the_program_meshes_writes_and_refuses() {
         assert_eq!(acies(&[command, &at("absent.xyz")]).0, 74);
     }
     assert_eq!(topology(0, &[]).vertices, 0);
+
+    // Points that are no part of the surface are in the mesh, and told.
+    let mut sphere = bodies::ellipsoid(2_000, DVec3::ONE * 10.0).points;
+    sphere.extend((0..20).map(|i| DVec3::new(30.0 + 7.0 * f64::from(i), f64::from(i % 3), 1.0)));
+    let lines: Vec<String> = sphere
+        .iter()
+        .map(|p| format!("{} {} {}", p.x, p.y, p.z))
+        .collect();
+    std::fs::write(at("outliers.xyz"), lines.join("\n")).expect("a scan");
+    let (status, said, wrong) = acies(&["mesh", &at("outliers.xyz")]);
+    assert_eq!(status, 0, "{wrong}");
+    assert!(
+        said.contains(" points lie more than") && said.contains("remove them first"),
+        "{said}"
+    );
 }

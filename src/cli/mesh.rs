@@ -92,10 +92,18 @@ impl Mesh {
         }
         if made.mending.after > 0 && !self.open {
             findings.push(format!(
-                "around {} vertices the surface is no manifold or misses them: too noisy or too sparse there",
+                "around {} vertices the surface is no manifold or misses them: too noisy or too sparse there, or seen from one side only, which \
+                 --open is for",
                 made.mending.after
             ));
         }
+        if topology.pieces > 1 && !self.open {
+            findings.push(format!(
+                "{} closed pieces: bodies apart or voids, points far from all others, or walls thinner than the spacing of points",
+                topology.pieces
+            ));
+        }
+        findings.extend(far_from_all(&made));
         let summary = Summary {
             points: positions.len(),
             vertices: made.positions.len(),
@@ -141,6 +149,31 @@ impl Mesh {
         }
         Ok(())
     }
+}
+
+/// Points that stand so far from all others that they may be no part of the surface, in words.
+fn far_from_all(made: &crate::mesh::Mesh) -> Option<String> {
+    /// So many times the spacing of three points in four: where a surface is sampled at all, its points vary less.
+    const FAR: f64 = 4.0;
+    let mut nearest = vec![f64::INFINITY; made.positions.len()];
+    for t in &made.triangles {
+        for k in 0..3 {
+            let [a, b] = [t[k], t[(k + 1) % 3]].map(|v| v as usize);
+            let length = made.positions[a].distance(made.positions[b]);
+            nearest[a] = nearest[a].min(length);
+            nearest[b] = nearest[b].min(length);
+        }
+    }
+    nearest.retain(|d| d.is_finite());
+    nearest.sort_unstable_by(f64::total_cmp);
+    let usual = *nearest.get(nearest.len() * 3 / 4)?;
+    let far = nearest.len() - nearest.partition_point(|d| *d <= FAR * usual);
+    (far > 0).then(|| {
+        format!(
+            "{far} points lie more than {:.3e} mm from all others, three in four within {usual:.3e}: remove them first if they are none of the surface",
+            FAR * usual
+        )
+    })
 }
 
 fn form_of(path: &Path) -> Result<Form, Failure> {

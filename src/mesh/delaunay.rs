@@ -21,7 +21,7 @@ pub const FACETS: [[usize; 3]; 4] = [[1, 3, 2], [0, 2, 3], [0, 3, 1], [0, 1, 2]]
 pub enum DelaunayError {
     /// The points span less than space: a plane, a line or a point.
     #[error(
-        "points: {distinct} distinct ones, all in one {}, expected a body in space",
+        "points: {distinct} distinct ones, all in one {}, expected a body in space; scan further sides of the part",
         ["point", "line", "plane"][*.dimension as usize]
     )]
     Flat {

@@ -8,7 +8,6 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use rayon::prelude::*;
 
 use super::delaunay::{Delaunay, GHOST};
-use super::handles::short_loops;
 use super::solid::Solid;
 use super::star::{Facets, Stars, corner};
 
@@ -139,8 +138,14 @@ pub fn mend(
     }
     turns += search.close_handles();
     if wrong.is_empty() {
-        turns += search.close_short_handles();
-        turns += search.join_islands();
+        // Islands that were joined to one another are joined to the rest in the next round.
+        for _ in 0..4 {
+            let joined = search.join_islands();
+            turns += joined;
+            if joined == 0 {
+                break;
+            }
+        }
     }
     Mending {
         before,
@@ -168,8 +173,6 @@ struct Search<'a> {
 
 /// Wrong vertices whose cells are looked at for one turn.
 const LOOKED_AT: usize = 3;
-/// Edges of the longest loop around a handle that samples can have made.
-const LONGEST_LOOP: usize = 10;
 /// Steps for which a turned cell rests: longer than the groups of cells that have to turn together.
 const REST: usize = 12;
 
@@ -247,45 +250,85 @@ impl Search<'_> {
         turns
     }
 
-    /// Closes handles that a few edges go around, though the surface gets larger: of all ways to turn cells at a loop the one is kept after which
-    /// it is smallest.
+    /// Turns one of the `starts`, rows of cells, and what has to follow, such that no vertex is wrong, the surface hangs together and has `wanted` triangles
+    /// more: the change with the fewest cells among those that are looked at, and of these the one after which the surface is smallest. How many
+    /// cells turned; 0 where nothing was found.
     ///
-    /// We differ: the thesis only counts handles (Ma 2011, equation 3.2).
-    fn close_short_handles(&mut self) -> usize {
-        const STEPS: usize = 40;
-        /// Cells that are tried in all: a surface with more short handles is no surface of a part.
-        const MOST: usize = 2_000;
-        let (mut turns, mut tries) = (0, 0);
-        for _ in 0..8 {
-            let triangles = super::solid::surface(self.delaunay, &self.solid.inside);
-            let loops = short_loops(self.delaunay.points.len(), &triangles, LONGEST_LOOP);
-            let mut closed = 0;
-            for ring in loops {
-                let mut best: Option<(f32, Vec<u32>)> = None;
-                for cell in self.cells_along(&ring) {
-                    tries += 1;
-                    if tries > MOST {
-                        break;
-                    }
-                    let (triangles, growth) = self.follow(cell, STEPS);
-                    let is_better = best.as_ref().is_none_or(|(least, _)| growth < *least);
-                    let is_less = triangles.is_some_and(|t| t < 0);
-                    if is_less && is_better && self.hangs_together() {
-                        best = Some((growth, self.journal.clone()));
-                    }
-                    self.take_back(0);
+    /// Breadth first, the most promising sets of each size only.
+    fn best_way(&mut self, starts: Vec<Vec<u32>>, wanted: i32) -> usize {
+        const WIDTH: usize = 100;
+        const DEPTH: usize = 16;
+        let mut front = starts;
+        let mut seen: HashSet<Vec<u32>> = HashSet::new();
+        for _ in 0..DEPTH {
+            let mut found: Option<(f32, Vec<u32>)> = None;
+            let mut next: Vec<(i32, f32, Vec<u32>)> = Vec::new();
+            for set in front {
+                let (triangles, growth, cost) = self.turn_all(&set);
+                let corners = set.iter().flat_map(|c| self.delaunay.cells[*c as usize]);
+                let mut wrong: Vec<u32> = corners
+                    .filter(|v| *v != GHOST && self.defects[*v as usize] > 0)
+                    .collect();
+                wrong.sort_unstable();
+                wrong.dedup();
+                let is_better = found.as_ref().is_none_or(|f| growth < f.0);
+                if wrong.is_empty() && triangles == wanted && is_better && self.hangs_together() {
+                    found = Some((growth, set.clone()));
                 }
-                for cell in best.map_or(Vec::new(), |b| b.1) {
-                    self.turn(cell);
-                    closed += 1;
+                let sum: i32 = wrong
+                    .iter()
+                    .map(|w| i32::from(self.defects[*w as usize]))
+                    .sum();
+                let stars = wrong.iter().flat_map(|w| self.stars.of(*w));
+                let mut choice: Vec<u32> = stars.map(|code| code >> 2).collect();
+                choice.sort_unstable();
+                choice.dedup();
+                for cell in choice {
+                    if set.contains(&cell) || !self.may_turn(cell) {
+                        continue;
+                    }
+                    let mut larger = set.clone();
+                    larger.insert(larger.partition_point(|c| *c < cell), cell);
+                    if seen.insert(larger.clone()) {
+                        let change = self.change_of_turning(cell);
+                        next.push((sum + change, cost + self.cost_of_turning(cell), larger));
+                    }
                 }
+                self.take_back(0);
             }
-            turns += closed;
-            if closed == 0 {
-                break;
+            if let Some((_, set)) = found {
+                self.turn_all(&set);
+                return set.len();
             }
+            next.sort_unstable_by(|a, b| {
+                (a.0.cmp(&b.0))
+                    .then(a.1.total_cmp(&b.1))
+                    .then_with(|| a.2.cmp(&b.2))
+            });
+            next.truncate(WIDTH);
+            front = next.into_iter().map(|n| n.2).collect();
         }
-        turns
+        0
+    }
+
+    /// Turns cells, into an empty journal: how many triangles the surface has more, how much larger the sum of their radii is, and the cost.
+    fn turn_all(&mut self, cells: &[u32]) -> (i32, f32, f32) {
+        self.journal.clear();
+        let mut sums = (0, 0.0, 0.0);
+        for cell in cells {
+            let (triangles, growth) = self.growth_of_turning(*cell);
+            let cost = self.cost_of_turning(*cell);
+            sums = (sums.0 + triangles, sums.1 + growth, sums.2 + cost);
+            self.turn(*cell);
+        }
+        sums
+    }
+
+    /// Whether the cell is none at infinity and hangs on its new side: otherwise it would be a body, or a void, of its own.
+    fn may_turn(&self, cell: u32) -> bool {
+        let side = self.solid.inside[cell as usize];
+        let mut neighbors = self.delaunay.neighbors[cell as usize].iter();
+        !self.delaunay.is_ghost(cell) && neighbors.any(|n| self.solid.inside[*n as usize] != side)
     }
 
     /// Joins islands, closed pieces of a few vertices beside the others, to what lies nearest: a row of cells is turned, and what has to follow. Kept
@@ -293,6 +336,7 @@ impl Search<'_> {
     fn join_islands(&mut self) -> usize {
         /// Vertices of the largest island; more are a body, or a void, of its own.
         const ISLAND: usize = 100;
+        const MOST: usize = 1_000;
         let triangles = super::solid::surface(self.delaunay, &self.solid.inside);
         let count = self.delaunay.points.len();
         let mut groups = super::check::Groups::new(count);
@@ -301,44 +345,37 @@ impl Search<'_> {
             groups.join(t[0], t[2]);
         }
         let piece: Vec<u32> = (0..count as u32).map(|v| groups.of(v)).collect();
-        let mut sizes = vec![0u32; count];
-        piece.iter().for_each(|p| sizes[*p as usize] += 1);
-        let is_island = |v: u32| sizes[piece[v as usize] as usize] as usize <= ISLAND;
+        let mut members: HashMap<u32, Vec<u32>> = HashMap::new();
+        for v in 0..count as u32 {
+            members.entry(piece[v as usize]).or_default().push(v);
+        }
+        let is_island = |m: &Vec<u32>| (4..=ISLAND).contains(&m.len());
+        let mut islands: Vec<Vec<u32>> = members.into_values().filter(is_island).collect();
+        islands.sort_unstable();
+        // More are no islands beside a surface.
+        islands.truncate(MOST);
         let mut turns = 0;
-        let mut joined: Vec<u32> = Vec::new();
-        for v in (0..count as u32).filter(|v| is_island(*v)) {
-            let own = piece[v as usize];
-            if sizes[own as usize] < 4 || joined.contains(&own) {
+        // Pieces that have become part of another.
+        let mut joined: HashSet<u32> = HashSet::new();
+        for island in islands {
+            if joined.contains(&piece[island[0] as usize]) {
                 continue;
             }
-            for inside in [false, true] {
-                let row = self.row_to_other_piece(v, inside, &piece);
-                if !row.is_empty() && self.join_by(&row) {
-                    turns += self.journal.len();
-                    joined.push(own);
-                    break;
-                }
-                self.take_back(0);
-            }
+            let mut rows: Vec<Vec<u32>> = (island.iter())
+                .flat_map(|v| [false, true].map(|side| self.row_to_other_piece(*v, side, &piece)))
+                .filter(|row| !row.is_empty())
+                .collect();
+            rows.iter_mut().for_each(|row| row.sort_unstable());
+            rows.sort_unstable_by(|a, b| a.len().cmp(&b.len()).then_with(|| a.cmp(b)));
+            rows.dedup();
+            // Two pieces with the same vertices have four triangles less than one.
+            let turned = self.best_way(rows, 4);
+            let cells = self.journal.iter().take(turned);
+            let corners = cells.flat_map(|c| self.delaunay.cells[*c as usize]);
+            joined.extend(corners.map(|v| piece[v as usize]));
+            turns += turned;
         }
         turns
-    }
-
-    /// Turns a row of cells and what has to follow; whether that made one piece of two.
-    fn join_by(&mut self, row: &[u32]) -> bool {
-        const STEPS: usize = 60;
-        self.journal.clear();
-        self.rests.clear();
-        let (last, before) = (row.len() - 1, &row[..row.len() - 1]);
-        let mut triangles = 0;
-        for cell in before {
-            triangles += self.growth_of_turning(*cell).0;
-            self.turn(*cell);
-            self.rests.insert(*cell, usize::MAX);
-        }
-        let (more, _) = self.follow_on(row[last], STEPS);
-        // Two pieces with the same vertices have four triangles less than one.
-        more.is_some_and(|more| triangles + more == 4) && self.hangs_together()
     }
 
     /// A shortest row of cells on one side of the surface from `v` to a vertex of another piece, which the last of them has; empty where there is none.
@@ -374,22 +411,6 @@ impl Search<'_> {
             at += 1;
         }
         Vec::new()
-    }
-
-    /// Cells with two neighbours of a loop among their corners.
-    fn cells_along(&self, ring: &[u32]) -> Vec<u32> {
-        let mut cells = Vec::new();
-        for (i, &v) in ring.iter().enumerate() {
-            let next = ring[(i + 1) % ring.len()];
-            let own = self.stars.of(v).iter().map(|code| code >> 2);
-            cells.extend(own.filter(|c| {
-                let corners = self.delaunay.cells[*c as usize];
-                corners.contains(&next) && !corners.contains(&GHOST)
-            }));
-        }
-        cells.sort_unstable();
-        cells.dedup();
-        cells
     }
 
     /// Whether turning the cell would make the surface smaller, but not without vertices that are wrong.

@@ -6,6 +6,7 @@
 use std::collections::HashMap;
 
 use super::Body;
+use super::check::Groups;
 use super::delaunay::{Delaunay, GHOST};
 use super::sheet::{is_needle, sheet};
 use super::star::vertices;
@@ -25,7 +26,44 @@ pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
             length <= (times * typical[a as usize].min(typical[b as usize])).min(most)
         })
     };
-    one_fan_each(delaunay.points.len(), sheet(body, is_seen))
+    let count = delaunay.points.len();
+    without_specks(count, one_fan_each(count, sheet(body, is_seen)))
+}
+
+/// Leaves out pieces of a few triangles around none of whose vertices they close: what noise hangs into the slits between scan lines.
+fn without_specks(vertices: usize, mut triangles: Vec<[u32; 3]>) -> Vec<[u32; 3]> {
+    /// Triangles of a speck at the most: two rings of six.
+    const SPECK: u32 = 12;
+    let mut pieces = Groups::new(vertices);
+    for t in &triangles {
+        pieces.join(t[0], t[1]);
+        pieces.join(t[0], t[2]);
+    }
+    let mut sizes = vec![0u32; vertices];
+    // Around a vertex with a whole ring every edge there has two triangles.
+    let mut ends: Vec<(u32, u32)> = Vec::with_capacity(6 * triangles.len());
+    for t in &triangles {
+        sizes[pieces.of(t[0]) as usize] += 1;
+        for k in 0..3 {
+            ends.push((t[k], t[(k + 1) % 3]));
+            ends.push((t[k], t[(k + 2) % 3]));
+        }
+    }
+    ends.sort_unstable();
+    let mut has_ring = vec![false; vertices];
+    for of_one in ends.chunk_by(|a, b| a.0 == b.0) {
+        if of_one
+            .chunk_by(|a, b| a.1 == b.1)
+            .all(|edge| edge.len() == 2)
+        {
+            has_ring[pieces.of(of_one[0].0) as usize] = true;
+        }
+    }
+    triangles.retain(|t| {
+        let piece = pieces.of(t[0]) as usize;
+        has_ring[piece] || sizes[piece] > SPECK
+    });
+    triangles
 }
 
 /// The facets whose smallest sphere is empty, needles left out: nearly all are on the surface.

@@ -9,9 +9,10 @@ use std::collections::HashMap;
 
 use rayon::prelude::*;
 
+use super::cut::Cut;
 use super::delaunay::{Delaunay, GHOST};
-use super::star::{Facets, Stars, corner};
-use super::umbrella::{is_matched, sides};
+use super::star::{Facets, Stars, corner, vertices};
+use super::umbrella::{facets_at, is_matched, sides};
 
 /// Which cells are inside the body.
 #[derive(Debug, Clone)]
@@ -276,23 +277,116 @@ pub fn surface(delaunay: &Delaunay, inside: &[bool]) -> Vec<[u32; 3]> {
     triangles
 }
 
-/// Turns cells of which their corners are not sure where sizes speak for it: before any vertex is looked at.
-pub fn settle(delaunay: &Delaunay, facets: &Facets, solid: &mut Solid) {
-    /// Votes up to this are no majority of four matched corners.
-    const UNSURE: i8 = 2;
-    let unsure: Vec<u32> = (0..delaunay.cells.len() as u32)
-        .filter(|c| (-UNSURE..=UNSURE).contains(&solid.votes[*c as usize]))
-        .collect();
-    for _ in 0..4 {
-        let mut turned = false;
-        for &cell in &unsure {
-            if super::mend::cost_of_turning(delaunay, facets, solid, cell) < -1e-3 {
-                solid.inside[cell as usize] ^= true;
-                turned = true;
-            }
+/// Decides the cells on which four matched corners do not agree all at once: of all ways to part them the cheapest, where a cell costs its votes
+/// against it, and a facet of the surface by how far its radius exceeds half of what is usual at its corners.
+///
+/// Turned one by one, cells stop at what no single one improves: slivers across the mouth of a hole, a wrong handle that takes three at once.
+/// The half leaves umbrellas their choice between facets of like size, which decides where edges run.
+pub fn settle(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Solid) {
+    /// Four matched corners that agree.
+    const SURE: u8 = 8;
+    const NONE: u32 = u32::MAX;
+    let scales = scales(delaunay, stars, facets);
+    let is_free = |solid: &Solid, c: u32| {
+        solid.votes[c as usize].unsigned_abs() < SURE && !delaunay.is_ghost(c)
+    };
+    // For every free cell its node in the graph of the cells that hang together with it.
+    let mut node = vec![NONE; delaunay.cells.len()];
+    let mut group: Vec<u32> = Vec::new();
+    for start in 0..delaunay.cells.len() as u32 {
+        if node[start as usize] != NONE || !is_free(solid, start) {
+            continue;
         }
-        if !turned {
-            break;
+        group.clear();
+        group.push(start);
+        node[start as usize] = 0;
+        let mut at = 0;
+        while at < group.len() {
+            for n in delaunay.neighbors[group[at] as usize] {
+                if node[n as usize] == NONE && is_free(solid, n) {
+                    node[n as usize] = group.len() as u32;
+                    group.push(n);
+                }
+            }
+            at += 1;
+        }
+        part(delaunay, facets, &scales, solid, (&group, &node));
+    }
+    // A body thinner than its spacing is cheapest where it is not at all: there the votes hold.
+    let inside = &solid.inside;
+    let is_passed = |v: u32| {
+        let mut cells = stars.of(v).iter().map(|code| inside[(code >> 2) as usize]);
+        let first = cells.next();
+        cells.all(|c| Some(c) == first)
+    };
+    let count = delaunay.points.len() as u32;
+    let passed: Vec<bool> = (0..count).into_par_iter().map(is_passed).collect();
+    for (cell, corners) in delaunay.cells.iter().enumerate() {
+        if !corners.contains(&GHOST) && corners.iter().all(|v| passed[*v as usize]) {
+            solid.inside[cell] = solid.votes[cell] > 0;
         }
     }
+}
+
+/// Parts one group of free cells, each with its node.
+fn part(
+    delaunay: &Delaunay,
+    facets: &Facets,
+    scales: &[f32],
+    solid: &mut Solid,
+    (group, node): (&[u32], &[u32]),
+) {
+    /// What one of the eight votes costs, where a facet of one and a half times the usual radius costs 1: half the votes of one matched corner.
+    const VOTE: f64 = 0.25;
+    /// Share of the usual radius that costs nothing.
+    const FREE: f64 = 0.5;
+    /// Of three points on a line the radius is infinite.
+    const MOST: f64 = 1e6;
+    let mut graph = Cut::new(group.len());
+    for &cell in group {
+        let own = node[cell as usize];
+        graph.prefer(own, VOTE * f64::from(solid.votes[cell as usize]));
+        for at in 0..4 {
+            let n = delaunay.neighbors[cell as usize][at];
+            let corners = vertices(delaunay, cell << 2 | at as u32);
+            let usual: f64 = corners.map(|v| f64::from(scales[v as usize])).iter().sum();
+            let times = 3.0 * f64::from(facets.radius(cell, at)) / usual;
+            let cost = (times - FREE).clamp(0.0, MOST);
+            if node[n as usize] == u32::MAX {
+                graph.prefer(
+                    own,
+                    if solid.inside[n as usize] {
+                        cost
+                    } else {
+                        -cost
+                    },
+                );
+            } else if cell < n {
+                graph.join(own, node[n as usize], cost);
+            }
+        }
+    }
+    for (cell, is_inside) in group.iter().zip(graph.cheapest()) {
+        solid.inside[*cell as usize] = is_inside;
+    }
+}
+
+/// Median radius of the facets of every vertex's umbrella.
+fn scales(delaunay: &Delaunay, stars: &Stars, facets: &Facets) -> Vec<f32> {
+    (0..delaunay.points.len() as u32)
+        .into_par_iter()
+        .map_init(Vec::new, |radii, v| {
+            radii.clear();
+            for (f, cell, at) in facets_at(delaunay, stars, v) {
+                if facets.is_in_umbrella_of(delaunay, f, v) {
+                    radii.push(facets.radius(cell, at));
+                }
+            }
+            if radii.is_empty() {
+                return f32::MAX;
+            }
+            let at = (radii.len() - 1) / 2;
+            *radii.select_nth_unstable_by(at, f32::total_cmp).1
+        })
+        .collect()
 }
