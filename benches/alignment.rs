@@ -38,8 +38,8 @@ const PARTS: [&str; 6] = [
 /// The spacing of the peers' figures, mm.
 const PEER_SPACING_MM: f64 = 0.26;
 
-/// Starts that one cloud serves; then the noise is drawn anew.
-const STARTS_OF_A_CLOUD: usize = 20;
+/// Starts that one cloud serves; then the noise is drawn anew: the error of the pose is that of the cloud, whatever the start.
+const STARTS_OF_A_CLOUD: usize = 4;
 
 struct Settings {
     starts: usize,

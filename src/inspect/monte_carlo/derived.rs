@@ -89,7 +89,7 @@ impl StationTrials {
                 quantified.u = u;
             }
         };
-        let mut forms: Vec<Option<EdgeForm>> = results.iter().map(|r| r.form.clone()).collect();
+        let mut forms: Vec<Option<EdgeForm>> = results.iter().map(|r| r.form).collect();
         for form in forms.iter_mut() {
             for value in of_form(form.as_mut()) {
                 match value {
