@@ -5,7 +5,9 @@ use rayon::prelude::*;
 
 use super::scene::Scene;
 use super::search::Pose;
-use super::{AlignOptions, Aligned, Candidates, Observation, Scan, Start, Step, TOO_FEW, Task};
+use super::{
+    AlignOptions, Aligned, Candidates, Observation, SETTLED, Scan, Start, Step, TOO_FEW, Task,
+};
 use crate::geometry::RigidTransform;
 use crate::inspect::assign::{Place, Surface};
 use crate::inspect::body::Body;
@@ -102,8 +104,8 @@ impl<B: Body> Task<'_, B> {
         for _ in 0..12 {
             let step = self.solve(&observed(&pose))?;
             pose = self.moved(&step.twist, pose);
-            let small =
-                step.twist.size(self.size_mm) < 0.05 * self.scan.noise_mm.max(1e-8 * self.size_mm);
+            let small = step.twist.size(self.size_mm)
+                < SETTLED * self.scan.noise_mm.max(1e-8 * self.size_mm);
             last = Some(step);
             if small {
                 break;
