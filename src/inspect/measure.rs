@@ -2,6 +2,8 @@
 
 use std::ops::Range;
 
+use glam::DVec3;
+
 use super::assign::{Place, Surface};
 use super::body::{Body, BodyEdge};
 use super::contributions::{Response, Shared};
@@ -190,20 +192,31 @@ impl<B: Body> EdgeContext<'_, B> {
         flanks: [&FlankFit; 2],
     ) -> Option<VirtualEdge> {
         intersect(station, self.edge.kind, flanks, |i, p| {
-            let height = (p - station.point).dot(station.normals[i]);
-            let Some(foot) = self.body.foot(self.edge.faces[i], p, None) else {
-                return [0.0; 2];
-            };
-            let sag = height - (p - foot.point).dot(foot.normal);
-            let rise = -foot.normal.dot(station.into_face[i]);
-            let slope = rise / foot.normal.dot(station.normals[i]);
-            // A foot on another sheet of the surface says nothing about this place.
-            if sag.abs() < 0.5 * (p - station.point).length() && slope.abs() < 0.5 {
-                [sag, slope]
-            } else {
-                [0.0; 2]
-            }
+            let bend = self.bend(station, i, p).or_else(|| {
+                // Beyond the border of its surface a face goes on as it bends on this side of it.
+                let b = station.into_face[i];
+                let inward = p - 2.0 * (p - station.point).dot(b) * b;
+                let [sag, slope] = self.bend(station, i, inward)?;
+                Some([sag, -slope])
+            });
+            bend.unwrap_or([0.0; 2])
         })
+    }
+
+    /// Height of nominal face `i` under `p` over its tangent plane at the station, mm, and its slope there into the face; `None` where the
+    /// face has no foot under it.
+    fn bend(&self, station: &Station, i: usize, p: DVec3) -> Option<[f64; 2]> {
+        let foot = self.body.foot(self.edge.faces[i], p, None)?;
+        let off = p - foot.point;
+        let distance = (p - station.point).length();
+        if off.reject_from_normalized(foot.normal).length() > 0.01 * distance {
+            return None;
+        }
+        let n = station.normals[i];
+        let sag = (p - station.point).dot(n) - off.dot(foot.normal);
+        let slope = -foot.normal.dot(station.into_face[i]) / foot.normal.dot(n);
+        // A foot on another sheet of the surface says nothing about this place.
+        (sag.abs() < 0.5 * distance && slope.abs() < 0.5).then_some([sag, slope])
     }
 
     fn measured(
