@@ -8,6 +8,7 @@
 #![allow(clippy::print_stdout, reason = "its tables are what it is for")]
 
 #[path = "../tests/edges/freeform.rs"]
+#[allow(dead_code, reason = "shared with the tests")]
 mod freeform;
 #[path = "../tests/edges/part.rs"]
 mod part;

@@ -120,7 +120,7 @@ impl Day {
 
     fn note(&mut self, running: &Running, id: i64, expected: Status) {
         let store = running.handle.store();
-        let inspection = store.inspection(id).expect("in the history");
+        let inspection = running.inspection(id);
         if inspection.phase == Phase::Aborted {
             // Nothing was measured; on a real cell the part would be put in again.
             self.aborted += 1;
@@ -240,18 +240,5 @@ fn ask_history(running: &Running, stored: i64) {
             store.usage().expect("usage");
         }),
     ];
-    for (name, ask) in questions {
-        let mut times: Vec<Duration> = (0..50)
-            .map(|_| {
-                let began = Instant::now();
-                ask();
-                began.elapsed()
-            })
-            .collect();
-        times.sort();
-        println!(
-            "{name:<20} median {:>9.2?}  worst {:>9.2?}",
-            times[25], times[49]
-        );
-    }
+    history::ask(&questions, 50);
 }

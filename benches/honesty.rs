@@ -45,7 +45,6 @@ fn main() {
         .skip(1)
         .find_map(|argument| argument.parse().ok());
     let seeds: u64 = number.unwrap_or(20);
-    let mut edges: BTreeMap<u64, EdgeScores> = BTreeMap::new();
     let mut stations: BTreeMap<(u64, usize), EdgeScores> = BTreeMap::new();
     let (mut profiles, mut scanning, mut deciding) = (0, 0.0, Vec::new());
     for seed in 1..=seeds {
@@ -59,7 +58,7 @@ fn main() {
             .sum::<u64>();
         scanning += outcome.scan_seconds;
         deciding.push(outcome.verdict_seconds);
-        score(&part, &outcome, &mut edges, &mut stations);
+        score(&part, &outcome, &mut stations);
     }
     if std::env::args().any(|argument| argument == "stations") {
         for ((entity, k), scores) in &stations {
@@ -67,7 +66,7 @@ fn main() {
             println!("#{entity} station {k:>3} {}", columns.join(" "));
         }
     }
-    print(&edges, seeds);
+    print(&stations, seeds);
     deciding.sort_by(f64::total_cmp);
     println!(
         "{:.0} profiles a second sustained, last profile to verdict {:.2} s (median)",
@@ -101,15 +100,10 @@ fn inspect(part: &DemoCell, seed: u64) -> Outcome {
     outcome
 }
 
-fn score(
-    part: &DemoCell,
-    outcome: &Outcome,
-    edges: &mut BTreeMap<u64, EdgeScores>,
-    stations: &mut BTreeMap<(u64, usize), EdgeScores>,
-) {
+fn score(part: &DemoCell, outcome: &Outcome, stations: &mut BTreeMap<(u64, usize), EdgeScores>) {
     for edge in &outcome.inspection.edges {
-        let scores = edges.entry(edge.nominal_entity).or_default();
         for (k, station) in edge.stations.iter().enumerate() {
+            let own = stations.entry((edge.nominal_entity, k)).or_default();
             let Some(measured) = &station.measured else {
                 continue;
             };
@@ -130,16 +124,14 @@ fn score(
                 (measured.d_mm[1] - truth.d2_mm) / u2,
                 angle_error / measured.u_included_angle_rad,
             ];
-            let own = stations.entry((edge.nominal_entity, k)).or_default();
-            for (i, z) in z.into_iter().enumerate() {
-                scores[i].z.push(z);
-                own[i].z.push(z);
+            for (scores, z) in own.iter_mut().zip(z) {
+                scores.z.push(z);
             }
         }
     }
 }
 
-fn print(edges: &BTreeMap<u64, EdgeScores>, seeds: u64) {
+fn print(stations: &BTreeMap<(u64, usize), EdgeScores>, seeds: u64) {
     println!(
         "{seeds} seeds; rms of error over u (and mean), and share within 2 u (aim 0.8 to 1.2, 93 to 97 %)"
     );
@@ -147,8 +139,19 @@ fn print(edges: &BTreeMap<u64, EdgeScores>, seeds: u64) {
         "{:>6} {:>8} {:>24} {:>24} {:>24}",
         "edge", "stations", "d1", "d2", "angle"
     );
+    let mut edges: BTreeMap<u64, EdgeScores> = BTreeMap::new();
     let mut all = EdgeScores::default();
-    for (entity, scores) in edges {
+    for ((entity, _), scores) in stations {
+        let edge = edges.entry(*entity).or_default();
+        for (sum, one) in edge
+            .iter_mut()
+            .chain(&mut all)
+            .zip(scores.iter().chain(scores))
+        {
+            sum.z.extend(&one.z);
+        }
+    }
+    for (entity, scores) in &edges {
         let columns = scores.each_ref().map(column);
         println!(
             "{:>6} {:>8} {}",
@@ -156,9 +159,6 @@ fn print(edges: &BTreeMap<u64, EdgeScores>, seeds: u64) {
             scores[0].z.len(),
             columns.join(" ")
         );
-        for (all, one) in all.iter_mut().zip(scores) {
-            all.z.extend(&one.z);
-        }
     }
     println!(
         "{:>6} {:>8} {}",

@@ -102,20 +102,7 @@ fn main() {
             drop(store.inspection(count / 2).expect("it"))
         }),
     ];
-    for (name, ask) in questions {
-        let mut times: Vec<Duration> = (0..200)
-            .map(|_| {
-                let began = Instant::now();
-                ask();
-                began.elapsed()
-            })
-            .collect();
-        times.sort();
-        println!(
-            "{name:<28} median {:>9.2?}  worst {:>9.2?}",
-            times[100], times[199]
-        );
-    }
+    history::ask(&questions, 200);
     let mut commits: Vec<Duration> = (0..200)
         .map(|number| {
             let began = Instant::now();

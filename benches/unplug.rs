@@ -43,11 +43,7 @@ fn main() {
             });
             played.unplug(device);
             running.until("ended", |s| ended(s, id));
-            let inspection = running
-                .handle
-                .store()
-                .inspection(id)
-                .expect("in the history");
+            let inspection = running.inspection(id);
             match inspection.phase {
                 Phase::Aborted => aborted += 1,
                 _ => other += 1,
@@ -68,11 +64,7 @@ fn main() {
     }
     let last = running.start_part("last");
     running.until("measured", |s| ended(s, last));
-    let inspection = running
-        .handle
-        .store()
-        .inspection(last)
-        .expect("in the history");
+    let inspection = running.inspection(last);
     println!(
         "afterwards a part is measured: {:?} {:?}",
         inspection.phase, inspection.verdict

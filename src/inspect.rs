@@ -316,9 +316,8 @@ fn judge_all<B: Body>(
         }
         corners
             .iter_mut()
-            .for_each(|c| corner::judge_again(c, recipe.rule));
-        gaps.iter_mut()
-            .for_each(|g| gap::judge_again(g, recipe.rule));
+            .for_each(|c| corner::judge_corner(c, recipe.rule));
+        gaps.iter_mut().for_each(|g| gap::judge_gap(g, recipe.rule));
     }
     let values = results
         .iter()

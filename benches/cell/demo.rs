@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use acies::cell::{Daemon, DaemonOptions, Handle, Mode, Refusal, Snapshot, State};
 use acies::config::Cell;
-use acies::store::{Order, Store};
+use acies::store::{Inspection, Order, Store};
 use acies_drivers::link::cable::Cable;
 use acies_simulators::demo_cell::DemoCell;
 use acies_simulators::wire::Wire;
@@ -75,6 +75,12 @@ impl Running {
         });
         let snapshot = || self.handle.snapshot();
         assert!(waited.is_ok(), "{what} did not come: {:#?}", snapshot());
+    }
+
+    /// An inspection as the history has it.
+    pub fn inspection(&self, id: i64) -> Inspection {
+        let found = self.handle.store().inspection(id);
+        found.expect("in the history")
     }
 
     /// Starts a part as soon as the cell is ready; gives the number of its inspection.

@@ -1,6 +1,7 @@
 //! A history as long as that of a cell that has worked for years.
 
 use std::path::Path;
+use std::time::{Duration, Instant};
 
 /// Writes `count` inspections into the database at `path`, twenty characteristics each, as the store writes them but in one
 /// transaction: making a million durable commits would take hours and tell nothing about questions. `scans` says whether they
@@ -57,4 +58,20 @@ pub fn fill(path: &Path, count: i64, scans: bool) {
         }
     }
     transaction.commit().expect("committed");
+}
+
+/// Asks every question `times` times, and prints how long it took.
+pub fn ask(questions: &[(&str, &dyn Fn())], times: usize) {
+    for (name, question) in questions {
+        let mut took: Vec<Duration> = (0..times)
+            .map(|_| {
+                let began = Instant::now();
+                question();
+                began.elapsed()
+            })
+            .collect();
+        took.sort();
+        let (median, worst) = (took[times / 2], took[times - 1]);
+        println!("{name:<28} median {median:>9.2?}  worst {worst:>9.2?}");
+    }
 }

@@ -132,14 +132,14 @@ pub fn measure<B: Body>(
                 }
                 Err(reason) => result.reason = reason,
             }
-            judge_again(&mut result, settings.rule);
+            judge_corner(&mut result, settings.rule);
             result
         })
         .collect()
 }
 
 /// The verdict on a corner as it stands: one that was not measured keeps no limit.
-pub fn judge_again(corner: &mut CornerResult, rule: Rule) {
+pub fn judge_corner(corner: &mut CornerResult, rule: Rule) {
     let unknown = Quantified {
         value: f64::NAN,
         u: 0.0,

@@ -207,26 +207,20 @@ pub fn measure_flank_again(
     let settled = settle_cuts::<4>(points, windows, settings, memo);
     let bent = fit_series::<4>(points, windows, &settled, memo);
     if bend_is_significant(&bent) {
-        let richer = fit_series::<5>(points, windows, &settled, memo);
-        return quadric(
-            points,
-            windows,
-            (&settled, &variance::estimate(&bent)),
-            memo,
-        )
-        .unwrap_or_else(|| finish(bent, &richer, &settled, FlankModel::Bent));
+        let noise = variance::estimate(&bent);
+        return quadric(points, windows, (&settled, &noise), memo).unwrap_or_else(|| {
+            let richer = fit_series::<5>(points, windows, &settled, memo);
+            finish((bent, noise), &richer, &settled, FlankModel::Bent)
+        });
     }
     // A straight flank is extrapolated with less noise, so its transition zone is seen more sharply.
     let settled = settle_cuts::<3>(points, windows, settings, memo);
     let straight = fit_series::<3>(points, windows, &settled, memo);
-    let richer = fit_series::<4>(points, windows, &settled, memo);
-    quadric(
-        points,
-        windows,
-        (&settled, &variance::estimate(&straight)),
-        memo,
-    )
-    .unwrap_or_else(|| finish(straight, &richer, &settled, FlankModel::Displaced))
+    let noise = variance::estimate(&straight);
+    quadric(points, windows, (&settled, &noise), memo).unwrap_or_else(|| {
+        let richer = fit_series::<4>(points, windows, &settled, memo);
+        finish((straight, noise), &richer, &settled, FlankModel::Displaced)
+    })
 }
 
 /// The flank with all terms of the second order, where a poorer model with this `noise` leaves something and twist or bow explain it.
@@ -240,11 +234,17 @@ fn quadric(
         return None;
     }
     let second = fit_series::<6>(points, windows, settled, memo);
-    if !twist_or_bow_is_significant(&second) {
+    let noise = variance::estimate(&second);
+    if !twist_or_bow_is_significant(&second, &noise) {
         return None;
     }
     let richer = fit_series::<7>(points, windows, settled, memo);
-    Some(finish(second, &richer, settled, FlankModel::Quadric))
+    Some(finish(
+        (second, noise),
+        &richer,
+        settled,
+        FlankModel::Quadric,
+    ))
 }
 
 /// The range that every station uses.
@@ -435,11 +435,10 @@ fn bend_is_significant(series: &Series<4>) -> bool {
 
 /// Whether the stations together show twist or bow, as [`bend_is_significant`] asks for the bend. Noise that a scan line shares looks like bow,
 /// so that it counts here.
-fn twist_or_bow_is_significant(series: &Series<6>) -> bool {
-    let noise = variance::estimate(series);
+fn twist_or_bow_is_significant(series: &Series<6>, noise: &[variance::Noise]) -> bool {
     [4, 5].into_iter().any(|term| {
         let (mut chi, mut count) = (0.0, 0.0);
-        for (window, noise) in series.iter().zip(&noise) {
+        for (window, noise) in series.iter().zip(noise) {
             let Ok(window) = window else { continue };
             let variance = noise.full(window)[term][term];
             if variance > 0.0 {
@@ -452,14 +451,13 @@ fn twist_or_bow_is_significant(series: &Series<6>) -> bool {
     })
 }
 
-/// Gives every station its covariance; `richer` is the same flank in a model of one unknown more.
+/// Gives every station its covariance by the noise of its fit; `richer` is the same flank in a model of one unknown more.
 fn finish<const P: usize, const Q: usize>(
-    series: Series<P>,
+    (series, noise): (Series<P>, Vec<variance::Noise>),
     richer: &Series<Q>,
     settled: &Settled,
     model: FlankModel,
 ) -> FlankSeries {
-    let noise = variance::estimate(&series);
     let form = variance::form_factors(&series, richer, &noise);
     let shared_factor = variance::shared_factor(&series, &noise, &form);
     let designs = if settled.settings.keep_designs {

@@ -32,12 +32,12 @@ pub fn measure(recipe: &GapRecipe, edges: [&EdgeResult; 2], rule: Rule) -> GapRe
     if gap.stations.is_empty() {
         gap.reason = "at no station both edges were measured opposite each other".to_owned();
     }
-    judge_again(&mut gap, rule);
+    judge_gap(&mut gap, rule);
     gap
 }
 
 /// The verdict on a gap as it stands: the worst of its stations'; limits of a gap that was nowhere measured are not decidable.
-pub fn judge_again(gap: &mut GapResult, rule: Rule) {
+pub fn judge_gap(gap: &mut GapResult, rule: Rule) {
     let worst = |value: fn(&GapStation) -> Quantified, limits: Option<[f64; 2]>| {
         gap.stations
             .iter()

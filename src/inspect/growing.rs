@@ -416,18 +416,13 @@ impl<'a, B: Body> Growing<'a, B> {
         }
         let laid = self.laid(ASKED_POINTS);
         let Some(base) = &mut self.base else { return };
-        let sketch = PointCloud::from_positions(Frame::Machine, Vec::new());
-        let neighbors = Neighbors::new(&[]);
-        let nothing = Scan {
-            cloud: &sketch,
-            neighbors: &neighbors,
-            spacing: base.spacing,
-            noise_mm: base.noise_mm,
-        };
         base.asked = self.points;
+        let known = (base.pose, &laid[..], base.spacing.along_mm);
+        let noise_mm = base.noise_mm;
+        let neighbors = Neighbors::new(&self.sketch.positions);
+        let scan = self.sketch_scan(&neighbors, noise_mm);
         let options = self.datums.options(&self.request);
-        let known = (base.pose, &laid[..]);
-        let settled = settle(&nothing, &self.surface, self.request.start, &options, known);
+        let settled = settle(&scan, &self.surface, self.request.start, &options, known);
         if let Some(pose) = settled {
             // Half of what would be too far at the end: it may go on.
             self.lay_again(pose, 0.5 * SMALL_MOTION, true);

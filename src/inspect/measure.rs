@@ -458,13 +458,11 @@ fn gap_text(gap: &FlankGap) -> String {
     }
 }
 
-/// Distance across the tangent from its two components along the normals, mm.
-pub(super) fn across(station: &Station, d: [f64; 2]) -> f64 {
-    let c = station.normals[0].dot(station.normals[1]);
-    let sine = (1.0 - c * c).max(1e-12);
-    ((d[0] * d[0] + d[1] * d[1] - 2.0 * c * d[0] * d[1]) / sine)
-        .max(0.0)
-        .sqrt()
+/// The shift across the tangent whose components along the normals are `d`, mm.
+pub(super) fn shift_across(station: &Station, d: [f64; 2]) -> DVec3 {
+    let [first, second] = station.normals;
+    let c = first.dot(second);
+    ((d[0] - c * d[1]) * first + (d[1] - c * d[0]) * second) / (1.0 - c * c).max(1e-12)
 }
 
 /// Distance across the tangent from its two components along the normals, with first-order uncertainty; near zero, where the
@@ -472,7 +470,7 @@ pub(super) fn across(station: &Station, d: [f64; 2]) -> f64 {
 fn total(station: &Station, d: [f64; 2], u: [f64; 2], covariance: f64) -> Quantified {
     let c = station.normals[0].dot(station.normals[1]);
     let sine = (1.0 - c * c).max(1e-12);
-    let value = across(station, d);
+    let value = shift_across(station, d).length();
     let worst = u[0].max(u[1]) / sine.sqrt();
     let by = [d[0] - c * d[1], d[1] - c * d[0]].map(|x| x / (sine * value.max(1e-12)));
     let variance = by[0].powi(2) * u[0].powi(2)

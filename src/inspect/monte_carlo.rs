@@ -21,7 +21,7 @@ use super::body::Body;
 use super::collect::Layer;
 use super::edge_break::draw_stretch;
 use super::flank::{Design, FlankFit};
-use super::measure::{EdgeContext, MeasureSettings, MeasuredEdge, across};
+use super::measure::{EdgeContext, MeasureSettings, MeasuredEdge, shift_across};
 use super::measuring::{Measuring, centre};
 use super::result::Measured;
 use crate::nominal::Station;
@@ -470,7 +470,7 @@ impl<B: Body> Model<'_, B> {
                 + self.settings.u_calibration_mm * inputs.of_face(i, CALIBRATION)
         });
         let angle = edge.included_angle_rad + self.settings.u_calibration_rad * inputs.shared();
-        Some([d[0], d[1], angle, across(&self.station, d)])
+        Some([d[0], d[1], angle, shift_across(&self.station, d).length()])
     }
 }
 

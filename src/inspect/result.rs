@@ -340,7 +340,7 @@ pub struct DepthPoint {
 }
 
 /// A value with its standard uncertainty, both in the unit of the field's name.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Quantified {
     /// The value.
     pub value: f64,

@@ -31,14 +31,14 @@ pub fn nominal_angle(station: &Station, kind: EdgeKind) -> f64 {
 
 /// The virtual edge of `flanks` at `station`; `None` where the flanks are parallel.
 ///
-/// Solves `(p - p0) . n_i - sag_i = offset_i + tilt_i (p - p0) . b_i` for p across t by Newton's method. `sag(i, p)` is the
-/// height of nominal face i over its tangent plane at p0 and its slope there along b_i, both 0 for a plane: they make the
+/// Solves `(p - p0) . n_i - sag_i = offset_i + tilt_i (p - p0) . b_i` for p across t by Newton's method. `bend(i, p)` is the
+/// height (sag) of nominal face i over its tangent plane at p0 and its slope there along b_i, both 0 for a plane: they make the
 /// intersection and its angle those of the curved faces, where these meet. The covariance is the linear propagation of both flanks', which share no points.
 pub fn intersect(
     station: &Station,
     kind: EdgeKind,
     flanks: [&FlankFit; 2],
-    sag: impl Fn(usize, DVec3) -> [f64; 2],
+    bend: impl Fn(usize, DVec3) -> [f64; 2],
 ) -> Option<VirtualEdge> {
     let [n, b] = [station.normals, station.into_face];
     // Coordinates in the plane across t.
@@ -56,7 +56,7 @@ pub fn intersect(
     let mut place = DVec2::ZERO;
     for _ in 0..4 {
         let p = at(place);
-        let right: [f64; 2] = std::array::from_fn(|i| flanks[i].offset_mm + sag(i, p)[0]);
+        let right: [f64; 2] = std::array::from_fn(|i| flanks[i].offset_mm + bend(i, p)[0]);
         place = inverse * DVec2::from(right);
     }
     let shift = place.x * x_axis + place.y * y_axis;
@@ -73,7 +73,7 @@ pub fn intersect(
     }
     let mut angle = nominal_angle(station, kind);
     for i in 0..2 {
-        let slope = flanks[i].tilt + sag(i, at(place))[1];
+        let slope = flanks[i].tilt + bend(i, at(place))[1];
         angle += slope.atan();
         jacobian[2][2 * i + 1] = 1.0 / (1.0 + slope.powi(2));
     }

@@ -10,6 +10,8 @@ pub struct FreeForm {
     depth: f64,
     /// Arc length of the edge at x = k * STEP.
     arc: Vec<f64>,
+    /// Whether the surfaces end where the faces do, as those of CAD files may: a foot beyond the edge is then on the edge.
+    ends: bool,
 }
 
 const STEP: f64 = 0.01;
@@ -44,7 +46,27 @@ impl FreeForm {
             length_x,
             depth: 8.0,
             arc,
+            ends: false,
         }
+    }
+
+    /// The same body on surfaces that end at its edge.
+    pub fn ending() -> Self {
+        Self {
+            ends: true,
+            ..Self::new()
+        }
+    }
+
+    /// The place of the edge nearest to `p`: x, y, z.
+    fn on_edge(p: DVec3) -> DVec3 {
+        let at = |x: f64| DVec3::new(x, wall(x).0, top(x, wall(x).0).0);
+        let mut x = p.x;
+        for _ in 0..30 {
+            let t = Self::tangent(x);
+            x += (p - at(x)).dot(t) / t.length_squared();
+        }
+        at(x)
     }
 
     fn tangent(x: f64) -> DVec3 {
@@ -86,6 +108,9 @@ impl Body for FreeForm {
                     break;
                 }
             }
+            if self.ends && at.y < wall(at.x).0 {
+                at = Self::on_edge(p).truncate();
+            }
             let (z, g, _) = top(at.x, at.y);
             return Some(Foot {
                 uv: (at.x, at.y),
@@ -102,10 +127,15 @@ impl Body for FreeForm {
                 break;
             }
         }
+        let mut z = p.z;
+        if self.ends && z > top(x, wall(x).0).0 {
+            let edge = Self::on_edge(p);
+            (x, z) = (edge.x, edge.z);
+        }
         let (y, d, _) = wall(x);
         Some(Foot {
-            uv: (x, p.z),
-            point: DVec3::new(x, y, p.z),
+            uv: (x, z),
+            point: DVec3::new(x, y, z),
             normal: DVec3::new(d, -1.0, 0.0).normalize(),
         })
     }

@@ -8,7 +8,7 @@ use glam::{DVec2, DVec3};
 
 use super::SIGMA;
 use super::solids::{Made, Noise, Solid};
-use super::whole::SLOT;
+use super::whole::{SLOT, slot_edge};
 
 const TRIALS: usize = 4000;
 
@@ -54,19 +54,11 @@ fn agree(what: &str, first: Quantified, drawn: Quantified) {
 #[test]
 fn corners_gaps_and_profiles_by_trials_have_the_uncertainties_of_first_order() {
     let (solid, cloud) = slot();
-    // The two upper edges of the slot, along z at x = 10 and 20.
-    let edge = |x: f64| {
-        use acies::inspect::Body;
-        let edges = solid.edges();
-        let place = |e: usize| solid.station(e, 0.5 * edges[e].length_mm).point;
-        let found = (0..edges.len()).find(|e| place(*e).distance(DVec3::new(x, 10.0, 12.5)) < 1e-6);
-        edges[found.expect("an edge along z")].id.clone()
-    };
     // A calibration that outweighs the noise: the worst of many stations is then none of many, but what they share.
     let text = format!(
         "u_calibration_mm = 0.02\n[[gap]]\nname = \"slot\"\nedges = [\"{}\", \"{}\"]\ngap_mm = [9.0, 11.0]\n",
-        edge(10.0),
-        edge(20.0)
+        slot_edge(&solid, 10.0),
+        slot_edge(&solid, 20.0)
     );
     let [first, drawn] = both(&solid, &cloud, &text);
     assert_eq!(drawn.trials.expect("trials").derived, TRIALS / 10);

@@ -106,6 +106,14 @@ pub(crate) const SLOT: [(f64, f64); 8] = [
     (0.0, 10.0),
 ];
 
+/// The edge along z at this x, on top of an arm.
+pub(crate) fn slot_edge(solid: &Solid, x: f64) -> String {
+    let edges = solid.edges();
+    let place = |e: usize| solid.station(e, 0.5 * edges[e].length_mm).point;
+    let found = (0..edges.len()).find(|e| place(*e).distance(DVec3::new(x, 10.0, 12.5)) < 1e-6);
+    edges[found.expect("an edge along z")].id.clone()
+}
+
 #[test]
 fn gap_and_flush_are_those_of_the_made_arms() {
     let mut noise = Noise(42);
@@ -121,12 +129,7 @@ fn gap_and_flush_are_those_of_the_made_arms() {
     solid.made[8] = made(-0.05);
     let seen: Vec<u32> = (2..10).collect();
     let cloud = solid.scan(&seen, SIGMA, &mut noise);
-    let edge = |x: f64| {
-        let edges = solid.edges();
-        let place = |e: usize| solid.station(e, 0.5 * edges[e].length_mm).point;
-        let found = (0..edges.len()).find(|e| place(*e).distance(DVec3::new(x, 10.0, 12.5)) < 1e-6);
-        edges[found.expect("an edge along z")].id.clone()
-    };
+    let edge = |x| slot_edge(&solid, x);
     let text = format!(
         "[[gap]]\nname = \"slot\"\nedges = [{:?}, {:?}]\ngap_mm = [9.9, 10.1]\nflush_mm = [-0.05, 0.05]\n\
          [[gap]]\nname = \"nowhere\"\nedges = [\"e1\", 77]",

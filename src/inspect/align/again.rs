@@ -53,17 +53,16 @@ pub(in crate::inspect) fn align_again<B: Body>(
     task.on_datums(aligned)
 }
 
-/// The pose alone by points that were laid on the nominal at `base`, as [`align_again`] finds it; `scan` says how far they lie apart, and
-/// its points are not looked at. `None` where too few lie near.
+/// The pose alone by points that were laid on the nominal at `base`, as [`align_again`] finds it; `None` where too few lie near.
 pub(in crate::inspect) fn settle<B: Body>(
-    scan: &Scan<'_>,
+    sketch: &Scan<'_>,
     surface: &Surface<'_, B>,
     start: Start,
     options: &AlignOptions<'_>,
-    (base, laid): (RigidTransform, &[LaidPoint]),
+    (base, laid, along_mm): (RigidTransform, &[LaidPoint], f64),
 ) -> Option<RigidTransform> {
-    let task = Task::new(scan, surface, start, options);
-    let (pose, ..) = task.settled(base, laid, scan.spacing.along_mm)?;
+    let task = Task::new(sketch, surface, start, options);
+    let (pose, ..) = task.settled(base, laid, along_mm)?;
     Some(pose)
 }
 

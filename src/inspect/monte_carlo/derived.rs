@@ -3,13 +3,12 @@
 //! A trial moves all stations together: the pose, the temperature, a face's calibration and what a scan line shares are one and the same for
 //! all of them.
 
-use glam::DMat2;
-use glam::DVec2;
 use rayon::prelude::*;
 
 use crate::inspect::corner::{self, Corner, CornerSettings};
+use crate::inspect::measure::shift_across;
 use crate::inspect::recipe::{GapRecipe, Recipe};
-use crate::inspect::result::{CornerResult, EdgeForm, EdgeResult, GapResult, Measured, Quantified};
+use crate::inspect::result::{CornerResult, EdgeForm, EdgeResult, GapResult, Quantified};
 use crate::inspect::verdict::Rule;
 use crate::inspect::{Body, BodyEdge, form, gap};
 
@@ -83,28 +82,14 @@ impl StationTrials {
             })
             .collect();
         let sums = sums.into_iter().reduce(Sums::merge).unwrap_or_default();
-        let mut values = sums.0.into_iter();
-        let mut drawn = |quantified: &mut Quantified| {
-            if let Some(Some(u)) = values.next().map(|sum| sum.u_about(quantified.value)) {
-                quantified.u = u;
-            }
-        };
         let mut forms: Vec<Option<EdgeForm>> = results.iter().map(|r| r.form).collect();
-        for form in forms.iter_mut() {
-            for value in of_form(form.as_mut()) {
-                match value {
-                    Some(value) => drawn(value),
-                    None => drawn(&mut Quantified::default()),
-                }
+        let quantities = quantities(&mut forms, corners, gaps);
+        for (quantity, sum) in quantities.into_iter().zip(sums.0) {
+            if let Some(quantity) = quantity
+                && let Some(u) = sum.u_about(quantity.value)
+            {
+                quantity.u = u;
             }
-        }
-        for corner in corners {
-            let mut none = Quantified::default();
-            drawn(corner.total_mm.as_mut().unwrap_or(&mut none));
-        }
-        for station in gaps.iter_mut().flat_map(|gap| &mut gap.stations) {
-            drawn(&mut station.gap_mm);
-            drawn(&mut station.flush_mm);
         }
         forms
     }
@@ -119,67 +104,56 @@ impl StationTrials {
                 else {
                     continue;
                 };
-                place(&to.station, own, *d, measured);
+                let change = [d[0] - own.d_mm[0], d[1] - own.d_mm[1]];
+                measured.d_mm = *d;
+                measured.point = own.point + shift_across(&to.station, change);
             }
         }
     }
 }
 
-/// Puts `measured` where d1 and d2 are `d_mm`, in the plane across the tangent.
-fn place(
-    station: &crate::nominal::Station,
-    own: &Measured,
-    d_mm: [f64; 2],
-    measured: &mut Measured,
-) {
-    let [a, b] = station.normals;
-    let x = a;
-    let y = station.tangent.cross(a).normalize_or_zero();
-    let rows = DMat2::from_cols(
-        DVec2::new(a.dot(x), b.dot(x)),
-        DVec2::new(a.dot(y), b.dot(y)),
-    );
-    let change = DVec2::new(d_mm[0] - own.d_mm[0], d_mm[1] - own.d_mm[1]);
-    let shift = rows.inverse() * change;
-    measured.d_mm = d_mm;
-    measured.point = own.point + shift.x * x + shift.y * y;
-}
-
-/// The values of a form in a fixed order, those that it lacks as well.
-fn of_form(form: Option<&mut EdgeForm>) -> [Option<&mut Quantified>; 4] {
-    match form {
-        None => [None, None, None, None],
-        Some(form) => [
-            form.straightness_mm.as_mut(),
-            Some(&mut form.line_profile_mm),
-            form.line_form_mm.as_mut(),
-            form.direction_rad.as_mut().map(|(value, _)| value),
-        ],
+/// Every derived value, always as many and in the same order; `None` where one does not come about.
+fn quantities<'q>(
+    forms: &'q mut [Option<EdgeForm>],
+    corners: &'q mut [CornerResult],
+    gaps: &'q mut [GapResult],
+) -> Vec<Option<&'q mut Quantified>> {
+    let mut quantities = Vec::new();
+    for form in forms {
+        quantities.extend(match form {
+            None => [None, None, None, None],
+            Some(form) => [
+                form.straightness_mm.as_mut(),
+                Some(&mut form.line_profile_mm),
+                form.line_form_mm.as_mut(),
+                form.direction_rad.as_mut().map(|(value, _)| value),
+            ],
+        });
     }
+    quantities.extend(corners.iter_mut().map(|corner| corner.total_mm.as_mut()));
+    for station in gaps.iter_mut().flat_map(|gap| &mut gap.stations) {
+        quantities.push(Some(&mut station.gap_mm));
+        quantities.push(Some(&mut station.flush_mm));
+    }
+    quantities
 }
 
-/// All derived values of one trial, always as many and in the same order; `None` where one does not come about.
+/// The derived values of one trial.
 fn values<B: Body>(derivation: &Derivation<'_, B>, moved: &[EdgeResult]) -> Vec<Option<f64>> {
-    let mut values = Vec::new();
-    for edge in moved {
-        let mut form = form::form(&edge.stations, derivation.recipe.direction_mm);
-        values.extend(of_form(form.as_mut()).map(|v| v.map(|v| v.value)));
-    }
-    let corners = corner::measure(
+    let form = |edge: &EdgeResult| form::form(&edge.stations, derivation.recipe.direction_mm);
+    let mut forms: Vec<Option<EdgeForm>> = moved.iter().map(form).collect();
+    let mut corners = corner::measure(
         derivation.body,
         derivation.corners,
         (derivation.edges, moved),
         &derivation.corner_settings,
     );
-    values.extend(corners.iter().map(|c| c.total_mm.map(|v| v.value)));
-    for (recipe, [a, b]) in derivation.gaps {
-        let gap = gap::measure(recipe, [&moved[*a], &moved[*b]], Rule::Simple);
-        for station in &gap.stations {
-            values.push(Some(station.gap_mm.value));
-            values.push(Some(station.flush_mm.value));
-        }
-    }
-    values
+    let gap = |(recipe, [a, b]): &(&GapRecipe, [usize; 2])| {
+        gap::measure(recipe, [&moved[*a], &moved[*b]], Rule::Simple)
+    };
+    let mut gaps: Vec<GapResult> = derivation.gaps.iter().map(gap).collect();
+    let quantities = quantities(&mut forms, &mut corners, &mut gaps);
+    quantities.into_iter().map(|q| q.map(|q| q.value)).collect()
 }
 
 /// Count, mean and sum of squared distances from it, of one value over trials.
