@@ -28,6 +28,8 @@ pub struct Surface<'a, B: Body> {
     samples: Vec<BodySample>,
     tree: Neighbors,
     grid: Grid,
+    /// See [`Body::smooth_pairs`].
+    smooth: Vec<[u32; 2]>,
     spacing_mm: f64,
     size_mm: f64,
 }
@@ -65,6 +67,7 @@ impl<'a, B: Body> Surface<'a, B> {
             grid: Grid::new(body, &samples, &tree, spacing_mm),
             tree,
             samples,
+            smooth: body.smooth_pairs(),
             spacing_mm,
             size_mm: (0.5 * (high - low).length()).max(1e-9),
         }
@@ -107,8 +110,8 @@ impl<'a, B: Body> Surface<'a, B> {
         self.place_and_rim(p, towards, gate_mm, found).0
     }
 
-    /// As [`Surface::place`], with the distance of `p` from the nearest edge between its face and another one that is not
-    /// tangent to it, mm, as far as faces near `p` tell: infinite in the middle of a face.
+    /// As [`Surface::place`], with the distance of the foot from the nearest edge between its face and another one into which it
+    /// does not pass smoothly, mm, as far as faces near `p` tell: infinite in the middle of a face.
     pub(super) fn place_and_rim(
         &self,
         p: DVec3,
@@ -131,13 +134,21 @@ impl<'a, B: Body> Surface<'a, B> {
             };
             best = kept;
             if other.place.face != NO_FACE && other.place.face != best.place.face {
-                rim = rim.min(distance_of_edge(&best.place, &other.place));
+                let distance = distance_of_edge(&best.place, &other.place);
+                if distance < rim && !self.pass_smoothly(best.place.face, other.place.face) {
+                    rim = distance;
+                }
             }
         }
         if best.inside && best.place.distance_mm <= gate_mm {
             return (best.place, rim);
         }
         (self.nearest_of_samples(p, towards, gate_mm, found), rim)
+    }
+
+    fn pass_smoothly(&self, a: u32, b: u32) -> bool {
+        let pair = [a.min(b), a.max(b)];
+        self.smooth.binary_search(&pair).is_ok()
     }
 
     /// The place by the nearest samples: wherever the cells do not tell.
@@ -232,15 +243,16 @@ impl Candidate {
     };
 }
 
-/// Distance of a point on one face from where its plane there meets the plane of another face; infinite where they are
-/// tangent to each other.
+/// Distance of the foot of a point on one face from where its plane there meets the plane of another face; infinite where they are
+/// tangent to each other. Of the foot, not of the point: what is chosen by the noise of the points is no longer free of bias.
 fn distance_of_edge(on: &Place, other: &Place) -> f64 {
     let sine = on.normal.cross(other.normal).length();
     // Below 5 degrees an edge is none: see the nominal's sharp edges.
     if sine < 0.0872 {
         return f64::INFINITY;
     }
-    other.deviation_mm.abs() / sine
+    let of_foot = other.deviation_mm - on.deviation_mm * on.normal.dot(other.normal);
+    of_foot.abs() / sine
 }
 
 /// The direction from which point `i` was seen, where it is known.

@@ -1,5 +1,7 @@
 //! What inspection asks of a nominal: exact feet on its faces, samples of them, and frames along its sharp edges.
 
+use std::collections::HashSet;
+
 use glam::DVec3;
 
 use crate::geometry::Surface;
@@ -61,6 +63,10 @@ pub trait Body: Sync {
     fn samples(&self, spacing_mm: f64) -> Vec<BodySample>;
     /// Its sharp edges.
     fn edges(&self) -> Vec<BodyEdge>;
+    /// Pairs of faces, the smaller index first, that pass into each other without a sharp edge anywhere; ascending.
+    fn smooth_pairs(&self) -> Vec<[u32; 2]> {
+        Vec::new()
+    }
     /// The frame at arc length `s_mm` of the sharp edge with index `edge`.
     fn station(&self, edge: usize, s_mm: f64) -> Station;
     /// Smallest and largest coordinates, mm.
@@ -74,6 +80,10 @@ pub trait Body: Sync {
     fn pmi(&self) -> &[Pmi] {
         &[]
     }
+}
+
+fn ordered([a, b]: [u32; 2]) -> [u32; 2] {
+    [a.min(b), a.max(b)]
 }
 
 impl Body for Nominal {
@@ -117,6 +127,18 @@ impl Body for Nominal {
                 closed: edge.closed,
             })
             .collect()
+    }
+
+    fn smooth_pairs(&self) -> Vec<[u32; 2]> {
+        let sharp: HashSet<[u32; 2]> = self.sharp_edges.iter().map(|e| ordered(e.faces)).collect();
+        let joined = self.edges.iter().filter_map(|edge| match edge.faces[..] {
+            [a, b] if a != b && !sharp.contains(&ordered([a, b])) => Some(ordered([a, b])),
+            _ => None,
+        });
+        let mut pairs: Vec<[u32; 2]> = joined.collect();
+        pairs.sort_unstable();
+        pairs.dedup();
+        pairs
     }
 
     fn station(&self, edge: usize, s_mm: f64) -> Station {

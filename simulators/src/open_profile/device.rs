@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use rand::{Rng, RngCore, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::feed::{Fed, Feed};
+use super::feed::{Fed, Feed, Traversed};
 use super::frame::{Frame, Receiver, VERSION, encode, encode_with_length, u32_at};
 use super::message as msg;
 use super::message::{Identity, ProfileHead, Reason, Scale, Status};
@@ -66,6 +66,8 @@ struct Tally {
 #[derive(Debug)]
 pub(super) struct Device {
     view: View,
+    /// The traverse of the last run.
+    traversed: Option<Arc<Traversed>>,
     setup: Setup,
     shared: Arc<Shared>,
     waker: Waker,
@@ -119,6 +121,7 @@ impl Device {
             life: 0,
             silent: setup.faults.silent_after == Some(0),
             unplug: false,
+            traversed: None,
             view,
             setup,
             shared,
@@ -316,8 +319,14 @@ impl Device {
         // a run that is still under way is abandoned: its feed must end before the next begins
         self.run = None;
         let began_ns = self.now_ns() + 1_000_000;
+        let view = self.view_of_run();
+        let traversed = match self.traversed.take() {
+            Some(traversed) if traversed.is_of(&view) => traversed,
+            _ => Arc::new(Traversed::new(view)),
+        };
+        self.traversed = Some(Arc::clone(&traversed));
         self.run = Some(Run {
-            feed: Feed::start(Arc::new(self.view_of_run()), self.waker.clone()),
+            feed: Feed::start(traversed, self.waker.clone()),
             count: (count > 0).then_some(count),
             keepalive: Duration::from_millis(keepalive_ms.into()),
             period: Duration::from_nanos(1_000_000_000_000 / self.settings.rate_mhz as u64),

@@ -1,8 +1,8 @@
-//! Profiles computed ahead of the wire, in blocks on all cores, at most a few blocks at a time.
+//! Profiles computed ahead of the wire, in blocks on all cores, at most a few blocks at a time, and kept for the next run.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, TryRecvError, sync_channel};
+use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 
 use rayon::prelude::*;
@@ -14,19 +14,60 @@ use crate::wire::Waker;
 const BLOCK: u32 = 16;
 /// Finished blocks that may wait.
 const AHEAD: usize = 2;
+/// Points that are kept, of 18 bytes each: a traverse of more is computed anew in every run.
+const KEPT: u64 = 4_000_000;
+
+type Block = Vec<Arc<Line>>;
+
+/// A traverse and what was computed of it. Every run over it gives the same lines, and following rays is most of a device's work.
+#[derive(Debug)]
+pub(super) struct Traversed {
+    view: View,
+    kept: Vec<OnceLock<Block>>,
+}
+
+impl Traversed {
+    pub fn new(view: View) -> Traversed {
+        let points = u64::from(view.traverse.profiles) * u64::from(view.columns);
+        let blocks = match points {
+            0..=KEPT => view.traverse.profiles.div_ceil(BLOCK),
+            _ => 0,
+        };
+        let kept = (0..blocks).map(|_| OnceLock::new()).collect();
+        Traversed { view, kept }
+    }
+
+    pub fn is_of(&self, view: &View) -> bool {
+        self.view.traverse == view.traverse && self.view.columns == view.columns
+    }
+
+    /// Lines from `number` times 16 on.
+    pub fn block(&self, number: u32) -> Block {
+        let compute = || {
+            let first = number * BLOCK;
+            let last = first.saturating_add(BLOCK).min(self.view.traverse.profiles);
+            let lines = (first..last).into_par_iter();
+            lines.map(|index| Arc::new(self.view.line(index))).collect()
+        };
+        match self.kept.get(number as usize) {
+            Some(kept) => kept.get_or_init(compute).clone(),
+            None => compute(),
+        }
+    }
+}
 
 /// The lines of one run, in order.
 #[derive(Debug)]
 pub(super) struct Feed {
-    blocks: Option<Receiver<Vec<Line>>>,
-    current: std::vec::IntoIter<Line>,
+    blocks: Option<Receiver<Block>>,
+    current: std::vec::IntoIter<Arc<Line>>,
     end: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
 
 /// What the feed has.
 pub(super) enum Fed {
-    Line(Box<Line>),
+    Line(Arc<Line>),
     /// Still computing; the waker says when.
     NotYet,
     /// The stage stands still.
@@ -35,18 +76,13 @@ pub(super) enum Fed {
 
 impl Feed {
     /// Starts to compute. Without a thread of its own it computes nothing, and the run is over at once.
-    pub fn start(view: Arc<View>, waker: Waker) -> Feed {
+    pub fn start(traversed: Arc<Traversed>, waker: Waker) -> Feed {
         let (sender, blocks) = sync_channel(AHEAD);
         let end = Arc::new(AtomicBool::new(false));
         let ended = end.clone();
         let compute = move || {
-            let n = view.traverse.profiles;
-            for first in (0..n).step_by(BLOCK as usize) {
-                let last = n.min(first.saturating_add(BLOCK));
-                let block: Vec<Line> = (first..last)
-                    .into_par_iter()
-                    .map(|index| view.line(index))
-                    .collect();
+            for number in 0..traversed.view.traverse.profiles.div_ceil(BLOCK) {
+                let block = traversed.block(number);
                 if ended.load(Ordering::Acquire) || sender.send(block).is_err() {
                     break;
                 }
@@ -72,7 +108,7 @@ impl Feed {
     pub fn next(&mut self) -> Fed {
         loop {
             if let Some(line) = self.current.next() {
-                return Fed::Line(Box::new(line));
+                return Fed::Line(line);
             }
             let Some(blocks) = &self.blocks else {
                 return Fed::Over;

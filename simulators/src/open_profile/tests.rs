@@ -522,3 +522,21 @@ fn over_tcp_a_second_host_is_sent_away_and_a_closed_connection_ends_the_run() {
     assert_eq!(stopped(&host.ask(msg::STOP, 2, &[]))[0], 5);
     assert_eq!(device.status().boots, 1);
 }
+
+#[test]
+fn a_traverse_kept_or_too_long_to_keep_gives_what_the_view_sees() {
+    // 40 profiles are two and a half blocks; of 100,001 points each they are too many to keep
+    for (columns, profiles) in [(7, 40), (100_001, 40_u32)] {
+        let view = view(columns, profiles);
+        let traversed = super::feed::Traversed::new(view.clone());
+        for number in [2, 0, 2] {
+            let block = traversed.block(number);
+            let expected = if number == 2 { 8 } else { 16 };
+            assert_eq!(block.len(), expected);
+            let last = number * 16 + block.len() as u32 - 1;
+            let seen = view.line(last).intensity;
+            assert_eq!(block.last().map(|line| &line.intensity), Some(&seen));
+        }
+        assert!(traversed.is_of(&view));
+    }
+}
