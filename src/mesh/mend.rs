@@ -136,20 +136,19 @@ pub fn mend(
             break;
         }
     }
+    turns += search.repair(&wrong);
     turns += search.close_handles();
-    if wrong.is_empty() {
-        // Islands that were joined to one another are joined to the rest in the next round.
-        for _ in 0..4 {
-            let joined = search.join_islands();
-            turns += joined;
-            if joined == 0 {
-                break;
-            }
+    // Islands that were joined to one another are joined to the rest in the next round.
+    for _ in 0..4 {
+        let joined = search.join_islands();
+        turns += joined;
+        if joined == 0 {
+            break;
         }
     }
     Mending {
         before,
-        after: wrong.len(),
+        after: search.defects.par_iter().filter(|d| **d > 0).count(),
         turns,
     }
 }
@@ -224,6 +223,26 @@ impl Search<'_> {
         self.journal.len()
     }
 
+    /// Searches wider around vertices that are still wrong, for a change after which none is.
+    fn repair(&mut self, wrong: &[u32]) -> usize {
+        /// Where more are wrong there is no body.
+        const MOST: usize = 100;
+        let mut turns = 0;
+        for &v in wrong.iter().take(MOST) {
+            if self.defects[v as usize] > 0 {
+                let mut starts: Vec<Vec<u32>> = (self.choices(v).into_iter())
+                    .filter(|c| self.may_turn(*c))
+                    .map(|c| vec![c])
+                    .collect();
+                let mut row = self.row_to_other_side(v);
+                row.sort_unstable();
+                starts.extend((!row.is_empty()).then_some(row));
+                turns += self.best_way(starts, None);
+            }
+        }
+        turns
+    }
+
     /// Closes handles and voids that no vertex needs: where turning a cell would make the surface smaller but leaves vertices wrong, turns it
     /// and looks whether the rest follows. Kept is what ends with no vertex wrong, fewer triangles and smaller ones.
     fn close_handles(&mut self) -> usize {
@@ -251,11 +270,11 @@ impl Search<'_> {
     }
 
     /// Turns one of the `starts`, rows of cells, and what has to follow, such that no vertex is wrong, the surface hangs together and has `wanted` triangles
-    /// more: the change with the fewest cells among those that are looked at, and of these the one after which the surface is smallest. How many
+    /// more, where that is said: the change with the fewest cells among those that are looked at, and of these the one after which the surface is smallest. How many
     /// cells turned; 0 where nothing was found.
     ///
     /// Breadth first, the most promising sets of each size only.
-    fn best_way(&mut self, starts: Vec<Vec<u32>>, wanted: i32) -> usize {
+    fn best_way(&mut self, starts: Vec<Vec<u32>>, wanted: Option<i32>) -> usize {
         const WIDTH: usize = 100;
         const DEPTH: usize = 16;
         let mut front = starts;
@@ -272,15 +291,15 @@ impl Search<'_> {
                 wrong.sort_unstable();
                 wrong.dedup();
                 let is_better = found.as_ref().is_none_or(|f| growth < f.0);
-                if wrong.is_empty() && triangles == wanted && is_better && self.hangs_together() {
+                let is_wanted = wanted.is_none_or(|w| triangles == w);
+                if wrong.is_empty() && is_wanted && is_better && self.hangs_together() {
                     found = Some((growth, set.clone()));
                 }
                 let sum: i32 = wrong
                     .iter()
                     .map(|w| i32::from(self.defects[*w as usize]))
                     .sum();
-                let stars = wrong.iter().flat_map(|w| self.stars.of(*w));
-                let mut choice: Vec<u32> = stars.map(|code| code >> 2).collect();
+                let mut choice: Vec<u32> = wrong.iter().flat_map(|w| self.choices(*w)).collect();
                 choice.sort_unstable();
                 choice.dedup();
                 for cell in choice {
@@ -369,7 +388,7 @@ impl Search<'_> {
             rows.sort_unstable_by(|a, b| a.len().cmp(&b.len()).then_with(|| a.cmp(b)));
             rows.dedup();
             // Two pieces with the same vertices have four triangles less than one.
-            let turned = self.best_way(rows, 4);
+            let turned = self.best_way(rows, Some(4));
             let cells = self.journal.iter().take(turned);
             let corners = cells.flat_map(|c| self.delaunay.cells[*c as usize]);
             joined.extend(corners.map(|v| piece[v as usize]));
@@ -585,9 +604,52 @@ impl Search<'_> {
         Vec::new()
     }
 
+    /// The cells that may be turned for the sake of wrong vertex `v`: all around it, but of a hub only those in or beside the smaller pieces there.
+    fn choices(&self, v: u32) -> Vec<u32> {
+        /// Cells around a vertex above which it is a hub: looked at one by one they cost the square of their number.
+        const HUB: usize = 256;
+        let star = self.stars.of(v);
+        if star.len() <= HUB {
+            return star.iter().map(|code| code >> 2).collect();
+        }
+        let inside = &self.solid.inside;
+        let mut pieces = super::check::Groups::new(star.len());
+        let beside = |i: usize| {
+            let (cell, own) = corner(star[i]);
+            let neighbors = self.delaunay.neighbors[cell as usize];
+            let others = (0..4).filter(move |at| *at != own);
+            others.map(move |at| star.partition_point(|c| c >> 2 < neighbors[at]))
+        };
+        let is_in = |i: usize| inside[(star[i] >> 2) as usize];
+        for i in 0..star.len() {
+            for j in beside(i).filter(|j| *j < i && is_in(*j) == is_in(i)) {
+                pieces.join(i as u32, j as u32);
+            }
+        }
+        let piece: Vec<u32> = (0..star.len() as u32).map(|i| pieces.of(i)).collect();
+        let mut sizes = vec![0usize; star.len()];
+        piece.iter().for_each(|p| sizes[*p as usize] += 1);
+        let largest = |side: bool| {
+            let own = (0..star.len()).filter(|i| is_in(*i) == side);
+            own.max_by_key(|i| sizes[piece[*i] as usize])
+                .map(|i| piece[i])
+        };
+        let kept = [largest(false), largest(true)];
+        let is_small = |i: usize| !kept.contains(&Some(piece[i]));
+        let is_passed = kept.contains(&None);
+        // Of a vertex that the surface passes by, cells that the surface reaches.
+        let is_near = |i: usize| {
+            let (cell, own) = corner(star[i]);
+            inside[self.delaunay.neighbors[cell as usize][own] as usize] != is_in(i)
+        };
+        (0..star.len())
+            .filter(|i| is_small(*i) || beside(*i).any(is_small) || (is_passed && is_near(*i)))
+            .map(|i| star[i] >> 2)
+            .collect()
+    }
+
     fn best_turn(&mut self, v: u32, step: usize, best: &mut Option<(i32, f32, u32)>) {
-        for code in self.stars.of(v) {
-            let cell = code >> 2;
+        for cell in self.choices(v) {
             let corners = self.delaunay.cells[cell as usize];
             let rests = self.rests.get(&cell).is_some_and(|until| *until > step);
             // A cell that hangs on nothing of its new side would be a body, or a void, of its own.
