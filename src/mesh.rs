@@ -6,6 +6,7 @@
 //! manifold through every point.
 
 mod build;
+mod carve;
 pub mod check;
 mod cone;
 mod curve;

@@ -7,8 +7,10 @@ use std::collections::{HashMap, HashSet, VecDeque};
 
 use rayon::prelude::*;
 
+use super::carve::carve;
+use super::check::topology;
 use super::delaunay::{Delaunay, GHOST};
-use super::solid::Solid;
+use super::solid::{Solid, surface};
 use super::star::{Facets, Stars, corner};
 
 /// How the mending went.
@@ -91,23 +93,61 @@ pub fn mend(
     solid: &mut Solid,
     is_wanted: bool,
 ) -> Mending {
-    let count = delaunay.points.len() as u32;
-    let inside = &solid.inside;
-    let defects: Vec<u8> = (0..count)
-        .into_par_iter()
-        .map_init(Ring::default, |ring, v| {
-            defect(delaunay, stars, inside, v, ring).min(255) as u8
-        })
-        .collect();
-    let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
-    let before = wrong.len();
-    if !is_wanted {
+    /// Where more than one vertex in so many is wrong, umbrellas made no body to begin with.
+    const NO_BODY: usize = 20;
+    let before = (defects(delaunay, stars, &solid.inside).iter())
+        .filter(|d| **d > 0)
+        .count();
+    if !is_wanted || before == 0 {
         return Mending {
             before,
             after: before,
             turns: 0,
         };
     }
+    let wish = solid.inside.clone();
+    let all = (delaunay, stars, facets);
+    let first = search(all, solid, None);
+    if first.after == 0 && NO_BODY * before <= delaunay.points.len() {
+        return first;
+    }
+    let mut other = solid.clone();
+    other.inside = carve(delaunay, stars, facets, &wish);
+    let second = search(all, &mut other, Some(&wish));
+    let second = Mending { before, ..second };
+    let rank = |mending: &Mending, inside: &[bool]| {
+        let t = topology(delaunay.points.len(), &surface(delaunay, inside));
+        // Pieces and handles together.
+        (mending.after, 2 * t.pieces as i64 - t.euler / 2)
+    };
+    if rank(&second, &other.inside) < rank(&first, &solid.inside) {
+        *solid = other;
+        second
+    } else {
+        first
+    }
+}
+
+/// For every vertex its defect, 255 at the most.
+fn defects(delaunay: &Delaunay, stars: &Stars, inside: &[bool]) -> Vec<u8> {
+    (0..delaunay.points.len() as u32)
+        .into_par_iter()
+        .map_init(Ring::default, |ring, v| {
+            defect(delaunay, stars, inside, v, ring).min(255) as u8
+        })
+        .collect()
+}
+
+/// Searches around all wrong vertices; where the body was carved, for what is left of the `wish` as well.
+fn search(
+    (delaunay, stars, facets): (&Delaunay, &Stars, &Facets),
+    solid: &mut Solid,
+    wish: Option<&[bool]>,
+) -> Mending {
+    let count = delaunay.points.len() as u32;
+    let defects = defects(delaunay, stars, &solid.inside);
+    let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
+    let before = wrong.len();
     let mut search = Search {
         delaunay,
         stars,
@@ -124,7 +164,7 @@ pub fn mend(
     for steps in [20, 60, 200, 600] {
         search.may_dig = steps >= 200;
         for &v in &wrong {
-            if search.defects[v as usize] > 0 {
+            if search.defects[v as usize] > 0 && !(search.may_dig && search.is_hub(v)) {
                 turns += search.around(v, steps);
             }
         }
@@ -137,6 +177,9 @@ pub fn mend(
         }
     }
     turns += search.repair(&wrong);
+    if let Some(wish) = wish {
+        turns += search.open_plugs(wish);
+    }
     turns += search.close_handles();
     // Islands that were joined to one another are joined to the rest in the next round.
     for _ in 0..4 {
@@ -170,6 +213,8 @@ struct Search<'a> {
     may_dig: bool,
 }
 
+/// Cells around a vertex above which it is a hub, as rows of points in one plane make them: looked at one by one they cost the square of their number.
+const HUB: usize = 256;
 /// Wrong vertices whose cells are looked at for one turn.
 const LOOKED_AT: usize = 3;
 /// Steps for which a turned cell rests: longer than the groups of cells that have to turn together.
@@ -200,8 +245,13 @@ impl Search<'_> {
                 break;
             }
             let mut best: Option<(i32, f32, u32)> = None;
-            for w in wrong.iter().rev().take(LOOKED_AT) {
-                self.best_turn(*w, step, &mut best);
+            let may_look = |w: &&u32| **w == v || !self.is_hub(**w);
+            let looked_at: Vec<u32> = (wrong.iter().rev().filter(may_look))
+                .take(LOOKED_AT)
+                .copied()
+                .collect();
+            for w in looked_at {
+                self.best_turn(w, step, &mut best);
             }
             let Some((change, _, cell)) = best else { break };
             self.turn(cell);
@@ -229,7 +279,7 @@ impl Search<'_> {
         const MOST: usize = 100;
         let mut turns = 0;
         for &v in wrong.iter().take(MOST) {
-            if self.defects[v as usize] > 0 {
+            if self.defects[v as usize] > 0 && !self.is_hub(v) {
                 let mut starts: Vec<Vec<u32>> = (self.choices(v).into_iter())
                     .filter(|c| self.may_turn(*c))
                     .map(|c| vec![c])
@@ -238,6 +288,41 @@ impl Search<'_> {
                 row.sort_unstable();
                 starts.extend((!row.is_empty()).then_some(row));
                 turns += self.best_way(starts, None);
+            }
+        }
+        turns
+    }
+
+    /// Turns what is left of the `wish` outside, plugs in through holes, voids and bridges between bodies: a plug at once. Kept
+    /// is what ends with no vertex wrong and a smaller surface, though it has a handle or a piece more.
+    fn open_plugs(&mut self, wish: &[bool]) -> usize {
+        let mut turns = 0;
+        let mut is_seen = vec![false; wish.len()];
+        for start in 0..wish.len() as u32 {
+            let is_left = |s: &Self, c: u32| {
+                s.solid.inside[c as usize] && !wish[c as usize] && !s.delaunay.is_ghost(c)
+            };
+            if is_seen[start as usize] || !is_left(self, start) {
+                continue;
+            }
+            is_seen[start as usize] = true;
+            let mut plug = vec![start];
+            let mut at = 0;
+            while at < plug.len() {
+                for n in self.delaunay.neighbors[plug[at] as usize] {
+                    if !is_seen[n as usize] && is_left(self, n) {
+                        is_seen[n as usize] = true;
+                        plug.push(n);
+                    }
+                }
+                at += 1;
+            }
+            let (_, growth, _) = self.turn_all(&plug);
+            let mut corners = plug.iter().flat_map(|c| self.delaunay.cells[*c as usize]);
+            if growth < 0.0 && corners.all(|v| self.defects[v as usize] == 0) {
+                turns += self.journal.len();
+            } else {
+                self.take_back(0);
             }
         }
         turns
@@ -299,7 +384,8 @@ impl Search<'_> {
                     .iter()
                     .map(|w| i32::from(self.defects[*w as usize]))
                     .sum();
-                let mut choice: Vec<u32> = wrong.iter().flat_map(|w| self.choices(*w)).collect();
+                let near = wrong.iter().filter(|w| !self.is_hub(**w));
+                let mut choice: Vec<u32> = near.flat_map(|w| self.choices(*w)).collect();
                 choice.sort_unstable();
                 choice.dedup();
                 for cell in choice {
@@ -439,7 +525,9 @@ impl Search<'_> {
         triangles <= 0
             && self.solid.votes[cell as usize].unsigned_abs() <= 4
             && !corners.contains(&GHOST)
-            && corners.iter().all(|c| self.defects[*c as usize] == 0)
+            && corners
+                .iter()
+                .all(|c| self.defects[*c as usize] == 0 && !self.is_hub(*c))
             && self.change_of_turning(cell) > 0
     }
 
@@ -604,12 +692,14 @@ impl Search<'_> {
         Vec::new()
     }
 
+    fn is_hub(&self, v: u32) -> bool {
+        self.stars.of(v).len() > HUB
+    }
+
     /// The cells that may be turned for the sake of wrong vertex `v`: all around it, but of a hub only those in or beside the smaller pieces there.
     fn choices(&self, v: u32) -> Vec<u32> {
-        /// Cells around a vertex above which it is a hub: looked at one by one they cost the square of their number.
-        const HUB: usize = 256;
         let star = self.stars.of(v);
-        if star.len() <= HUB {
+        if !self.is_hub(v) {
             return star.iter().map(|code| code >> 2).collect();
         }
         let inside = &self.solid.inside;
