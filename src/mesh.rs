@@ -6,6 +6,7 @@
 //! manifold through every point.
 
 mod build;
+mod carve;
 pub mod check;
 mod cone;
 mod curve;
@@ -14,6 +15,7 @@ pub mod delaunay;
 pub mod mend;
 pub mod normals;
 mod open;
+mod part;
 pub mod picture;
 mod predicates;
 pub mod sharpen;
@@ -58,7 +60,8 @@ impl Default for Settings {
 /// A mesh of V vertices, each a point of the input, and F triangles.
 #[derive(Debug, Clone)]
 pub struct Mesh {
-    /// V positions, mm: the distinct input points in input order.
+    /// V positions, mm: the distinct input points in input order; behind them again those at which the surface comes together more than once, where
+    /// it is parted.
     pub positions: Vec<DVec3>,
     /// For every vertex the index of the first input point there.
     pub sources: Vec<u32>,
@@ -170,15 +173,21 @@ impl Body {
         let start = Instant::now();
         let mut sources = self.delaunay.sources.clone();
         sources.sort_unstable();
-        let numbers: Vec<u32> = (self.delaunay.sources.iter())
+        let mut numbers: Vec<u32> = (self.delaunay.sources.iter())
             // Every source is in the list it was copied to.
             .map(|s| sources.partition_point(|other| other < s) as u32)
             .collect();
-        let triangles = if settings.open {
+        let mut triangles = if settings.open {
             open::seen_triangles(self)
         } else {
             surface(&self.delaunay, &self.solid.inside)
         };
+        if !settings.open && self.mending.after > 0 {
+            for v in part::part(&self.delaunay, &self.solid.inside, &mut triangles) {
+                numbers.push(sources.len() as u32);
+                sources.push(self.delaunay.sources[v as usize]);
+            }
+        }
         let mut triangles: Vec<[u32; 3]> = (triangles.into_iter())
             .map(|t| {
                 let [a, b, c] = t.map(|v| numbers[v as usize]);

@@ -593,6 +593,50 @@ fn small_through_holes_stay_open() {
     }
 }
 
+#[test]
+fn plates_thinner_than_the_spacing_are_one_body() {
+    let profile =
+        |z: f64| [(0.0, 0.0), (30.0, 0.0), (30.0, z), (0.0, z)].map(|(x, z)| DVec2::new(x, z));
+    for (name, times) in [("random", 0.05), ("lattice", 0.5)] {
+        let thick = 0.5 * times;
+        let count = (1_200.0 + 100.0 * thick) as usize * 4;
+        let plate = extrusion(&profile(thick), 20.0, &[]);
+        let random = plate.sample(count, 0.0, 1).points;
+        let lattice: Vec<DVec3> = (0..61 * 41 * 2)
+            .map(|i| {
+                let (x, y, upper) = (i % 61, i / 61 % 41, f64::from(i / (61 * 41)));
+                let shift = 0.25 * upper;
+                DVec3::new(
+                    f64::from(x) * 0.5 + shift,
+                    f64::from(y) * 0.5 + shift,
+                    upper * thick,
+                )
+            })
+            .collect();
+        let points = if name == "random" { random } else { lattice };
+        let made = closed(&format!("{name}, {times} spacings"), &points, 0);
+        // Of random points the outermost lie off the edges, and dents are of the order of the thickness.
+        let share = volume(&made) / (600.0 * thick);
+        assert!(
+            (0.9..1.0 + 1e-9).contains(&share),
+            "{name}, {times}: {share}"
+        );
+    }
+}
+
+#[test]
+fn a_wrong_vertex_among_ten_million_and_islands_beside_it_are_mended() {
+    // The points around it, and every eight-thousandth of the others.
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/mesh/islands.xyz");
+    let points = read(&path, Unit::Millimetre)
+        .expect("points")
+        .cloud
+        .positions;
+    assert_eq!(points.len(), 1_346);
+    // The block has two through holes.
+    closed("part of ten million", &points, 2);
+}
+
 fn acies(arguments: &[&str]) -> (i32, String, String) {
     let output = Command::new(env!("CARGO_BIN_EXE_acies"))
         .args(arguments)

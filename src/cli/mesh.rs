@@ -92,7 +92,7 @@ impl Mesh {
         }
         if made.mending.after > 0 && !self.open {
             findings.push(format!(
-                "around {} vertices the surface is no manifold or misses them: too noisy or too sparse there, or seen from one side only, which \
+                "at {} points the surface comes together more than once, where it is parted and the point twice a vertex, or misses them: too noisy or too sparse there, or seen from one side only, which \
                  --open is for",
                 made.mending.after
             ));

@@ -7,8 +7,10 @@ use std::collections::{HashMap, HashSet, VecDeque};
 
 use rayon::prelude::*;
 
+use super::carve::carve;
+use super::check::topology;
 use super::delaunay::{Delaunay, GHOST};
-use super::solid::Solid;
+use super::solid::{Solid, surface};
 use super::star::{Facets, Stars, corner};
 
 /// How the mending went.
@@ -91,23 +93,61 @@ pub fn mend(
     solid: &mut Solid,
     is_wanted: bool,
 ) -> Mending {
-    let count = delaunay.points.len() as u32;
-    let inside = &solid.inside;
-    let defects: Vec<u8> = (0..count)
-        .into_par_iter()
-        .map_init(Ring::default, |ring, v| {
-            defect(delaunay, stars, inside, v, ring).min(255) as u8
-        })
-        .collect();
-    let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
-    let before = wrong.len();
-    if !is_wanted {
+    /// Where more than one vertex in so many is wrong, umbrellas made no body to begin with.
+    const NO_BODY: usize = 20;
+    let before = (defects(delaunay, stars, &solid.inside).iter())
+        .filter(|d| **d > 0)
+        .count();
+    if !is_wanted || before == 0 {
         return Mending {
             before,
             after: before,
             turns: 0,
         };
     }
+    let wish = solid.inside.clone();
+    let all = (delaunay, stars, facets);
+    let first = search(all, solid, None);
+    if first.after == 0 && NO_BODY * before <= delaunay.points.len() {
+        return first;
+    }
+    let mut other = solid.clone();
+    other.inside = carve(delaunay, stars, facets, &wish);
+    let second = search(all, &mut other, Some(&wish));
+    let second = Mending { before, ..second };
+    let rank = |mending: &Mending, inside: &[bool]| {
+        let t = topology(delaunay.points.len(), &surface(delaunay, inside));
+        // Pieces and handles together.
+        (mending.after, 2 * t.pieces as i64 - t.euler / 2)
+    };
+    if rank(&second, &other.inside) < rank(&first, &solid.inside) {
+        *solid = other;
+        second
+    } else {
+        first
+    }
+}
+
+/// For every vertex its defect, 255 at the most.
+fn defects(delaunay: &Delaunay, stars: &Stars, inside: &[bool]) -> Vec<u8> {
+    (0..delaunay.points.len() as u32)
+        .into_par_iter()
+        .map_init(Ring::default, |ring, v| {
+            defect(delaunay, stars, inside, v, ring).min(255) as u8
+        })
+        .collect()
+}
+
+/// Searches around all wrong vertices; where the body was carved, for what is left of the `wish` as well.
+fn search(
+    (delaunay, stars, facets): (&Delaunay, &Stars, &Facets),
+    solid: &mut Solid,
+    wish: Option<&[bool]>,
+) -> Mending {
+    let count = delaunay.points.len() as u32;
+    let defects = defects(delaunay, stars, &solid.inside);
+    let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
+    let before = wrong.len();
     let mut search = Search {
         delaunay,
         stars,
@@ -124,7 +164,7 @@ pub fn mend(
     for steps in [20, 60, 200, 600] {
         search.may_dig = steps >= 200;
         for &v in &wrong {
-            if search.defects[v as usize] > 0 {
+            if search.defects[v as usize] > 0 && !(search.may_dig && search.is_hub(v)) {
                 turns += search.around(v, steps);
             }
         }
@@ -136,20 +176,22 @@ pub fn mend(
             break;
         }
     }
+    turns += search.repair(&wrong);
+    if let Some(wish) = wish {
+        turns += search.open_plugs(wish);
+    }
     turns += search.close_handles();
-    if wrong.is_empty() {
-        // Islands that were joined to one another are joined to the rest in the next round.
-        for _ in 0..4 {
-            let joined = search.join_islands();
-            turns += joined;
-            if joined == 0 {
-                break;
-            }
+    // Islands that were joined to one another are joined to the rest in the next round.
+    for _ in 0..4 {
+        let joined = search.join_islands();
+        turns += joined;
+        if joined == 0 {
+            break;
         }
     }
     Mending {
         before,
-        after: wrong.len(),
+        after: search.defects.par_iter().filter(|d| **d > 0).count(),
         turns,
     }
 }
@@ -171,6 +213,8 @@ struct Search<'a> {
     may_dig: bool,
 }
 
+/// Cells around a vertex above which it is a hub, as rows of points in one plane make them: looked at one by one they cost the square of their number.
+const HUB: usize = 256;
 /// Wrong vertices whose cells are looked at for one turn.
 const LOOKED_AT: usize = 3;
 /// Steps for which a turned cell rests: longer than the groups of cells that have to turn together.
@@ -201,8 +245,13 @@ impl Search<'_> {
                 break;
             }
             let mut best: Option<(i32, f32, u32)> = None;
-            for w in wrong.iter().rev().take(LOOKED_AT) {
-                self.best_turn(*w, step, &mut best);
+            let may_look = |w: &&u32| **w == v || !self.is_hub(**w);
+            let looked_at: Vec<u32> = (wrong.iter().rev().filter(may_look))
+                .take(LOOKED_AT)
+                .copied()
+                .collect();
+            for w in looked_at {
+                self.best_turn(w, step, &mut best);
             }
             let Some((change, _, cell)) = best else { break };
             self.turn(cell);
@@ -222,6 +271,61 @@ impl Search<'_> {
             self.touched.extend(self.delaunay.cells[*cell as usize]);
         }
         self.journal.len()
+    }
+
+    /// Searches wider around vertices that are still wrong, for a change after which none is.
+    fn repair(&mut self, wrong: &[u32]) -> usize {
+        /// Where more are wrong there is no body.
+        const MOST: usize = 100;
+        let mut turns = 0;
+        for &v in wrong.iter().take(MOST) {
+            if self.defects[v as usize] > 0 && !self.is_hub(v) {
+                let mut starts: Vec<Vec<u32>> = (self.choices(v).into_iter())
+                    .filter(|c| self.may_turn(*c))
+                    .map(|c| vec![c])
+                    .collect();
+                let mut row = self.row_to_other_side(v);
+                row.sort_unstable();
+                starts.extend((!row.is_empty()).then_some(row));
+                turns += self.best_way(starts, None);
+            }
+        }
+        turns
+    }
+
+    /// Turns what is left of the `wish` outside, plugs in through holes, voids and bridges between bodies: a plug at once. Kept
+    /// is what ends with no vertex wrong and a smaller surface, though it has a handle or a piece more.
+    fn open_plugs(&mut self, wish: &[bool]) -> usize {
+        let mut turns = 0;
+        let mut is_seen = vec![false; wish.len()];
+        for start in 0..wish.len() as u32 {
+            let is_left = |s: &Self, c: u32| {
+                s.solid.inside[c as usize] && !wish[c as usize] && !s.delaunay.is_ghost(c)
+            };
+            if is_seen[start as usize] || !is_left(self, start) {
+                continue;
+            }
+            is_seen[start as usize] = true;
+            let mut plug = vec![start];
+            let mut at = 0;
+            while at < plug.len() {
+                for n in self.delaunay.neighbors[plug[at] as usize] {
+                    if !is_seen[n as usize] && is_left(self, n) {
+                        is_seen[n as usize] = true;
+                        plug.push(n);
+                    }
+                }
+                at += 1;
+            }
+            let (_, growth, _) = self.turn_all(&plug);
+            let mut corners = plug.iter().flat_map(|c| self.delaunay.cells[*c as usize]);
+            if growth < 0.0 && corners.all(|v| self.defects[v as usize] == 0) {
+                turns += self.journal.len();
+            } else {
+                self.take_back(0);
+            }
+        }
+        turns
     }
 
     /// Closes handles and voids that no vertex needs: where turning a cell would make the surface smaller but leaves vertices wrong, turns it
@@ -251,11 +355,11 @@ impl Search<'_> {
     }
 
     /// Turns one of the `starts`, rows of cells, and what has to follow, such that no vertex is wrong, the surface hangs together and has `wanted` triangles
-    /// more: the change with the fewest cells among those that are looked at, and of these the one after which the surface is smallest. How many
+    /// more, where that is said: the change with the fewest cells among those that are looked at, and of these the one after which the surface is smallest. How many
     /// cells turned; 0 where nothing was found.
     ///
     /// Breadth first, the most promising sets of each size only.
-    fn best_way(&mut self, starts: Vec<Vec<u32>>, wanted: i32) -> usize {
+    fn best_way(&mut self, starts: Vec<Vec<u32>>, wanted: Option<i32>) -> usize {
         const WIDTH: usize = 100;
         const DEPTH: usize = 16;
         let mut front = starts;
@@ -272,15 +376,16 @@ impl Search<'_> {
                 wrong.sort_unstable();
                 wrong.dedup();
                 let is_better = found.as_ref().is_none_or(|f| growth < f.0);
-                if wrong.is_empty() && triangles == wanted && is_better && self.hangs_together() {
+                let is_wanted = wanted.is_none_or(|w| triangles == w);
+                if wrong.is_empty() && is_wanted && is_better && self.hangs_together() {
                     found = Some((growth, set.clone()));
                 }
                 let sum: i32 = wrong
                     .iter()
                     .map(|w| i32::from(self.defects[*w as usize]))
                     .sum();
-                let stars = wrong.iter().flat_map(|w| self.stars.of(*w));
-                let mut choice: Vec<u32> = stars.map(|code| code >> 2).collect();
+                let near = wrong.iter().filter(|w| !self.is_hub(**w));
+                let mut choice: Vec<u32> = near.flat_map(|w| self.choices(*w)).collect();
                 choice.sort_unstable();
                 choice.dedup();
                 for cell in choice {
@@ -369,7 +474,7 @@ impl Search<'_> {
             rows.sort_unstable_by(|a, b| a.len().cmp(&b.len()).then_with(|| a.cmp(b)));
             rows.dedup();
             // Two pieces with the same vertices have four triangles less than one.
-            let turned = self.best_way(rows, 4);
+            let turned = self.best_way(rows, Some(4));
             let cells = self.journal.iter().take(turned);
             let corners = cells.flat_map(|c| self.delaunay.cells[*c as usize]);
             joined.extend(corners.map(|v| piece[v as usize]));
@@ -420,7 +525,9 @@ impl Search<'_> {
         triangles <= 0
             && self.solid.votes[cell as usize].unsigned_abs() <= 4
             && !corners.contains(&GHOST)
-            && corners.iter().all(|c| self.defects[*c as usize] == 0)
+            && corners
+                .iter()
+                .all(|c| self.defects[*c as usize] == 0 && !self.is_hub(*c))
             && self.change_of_turning(cell) > 0
     }
 
@@ -585,9 +692,54 @@ impl Search<'_> {
         Vec::new()
     }
 
+    fn is_hub(&self, v: u32) -> bool {
+        self.stars.of(v).len() > HUB
+    }
+
+    /// The cells that may be turned for the sake of wrong vertex `v`: all around it, but of a hub only those in or beside the smaller pieces there.
+    fn choices(&self, v: u32) -> Vec<u32> {
+        let star = self.stars.of(v);
+        if !self.is_hub(v) {
+            return star.iter().map(|code| code >> 2).collect();
+        }
+        let inside = &self.solid.inside;
+        let mut pieces = super::check::Groups::new(star.len());
+        let beside = |i: usize| {
+            let (cell, own) = corner(star[i]);
+            let neighbors = self.delaunay.neighbors[cell as usize];
+            let others = (0..4).filter(move |at| *at != own);
+            others.map(move |at| star.partition_point(|c| c >> 2 < neighbors[at]))
+        };
+        let is_in = |i: usize| inside[(star[i] >> 2) as usize];
+        for i in 0..star.len() {
+            for j in beside(i).filter(|j| *j < i && is_in(*j) == is_in(i)) {
+                pieces.join(i as u32, j as u32);
+            }
+        }
+        let piece: Vec<u32> = (0..star.len() as u32).map(|i| pieces.of(i)).collect();
+        let mut sizes = vec![0usize; star.len()];
+        piece.iter().for_each(|p| sizes[*p as usize] += 1);
+        let largest = |side: bool| {
+            let own = (0..star.len()).filter(|i| is_in(*i) == side);
+            own.max_by_key(|i| sizes[piece[*i] as usize])
+                .map(|i| piece[i])
+        };
+        let kept = [largest(false), largest(true)];
+        let is_small = |i: usize| !kept.contains(&Some(piece[i]));
+        let is_passed = kept.contains(&None);
+        // Of a vertex that the surface passes by, cells that the surface reaches.
+        let is_near = |i: usize| {
+            let (cell, own) = corner(star[i]);
+            inside[self.delaunay.neighbors[cell as usize][own] as usize] != is_in(i)
+        };
+        (0..star.len())
+            .filter(|i| is_small(*i) || beside(*i).any(is_small) || (is_passed && is_near(*i)))
+            .map(|i| star[i] >> 2)
+            .collect()
+    }
+
     fn best_turn(&mut self, v: u32, step: usize, best: &mut Option<(i32, f32, u32)>) {
-        for code in self.stars.of(v) {
-            let cell = code >> 2;
+        for cell in self.choices(v) {
             let corners = self.delaunay.cells[cell as usize];
             let rests = self.rests.get(&cell).is_some_and(|until| *until > step);
             // A cell that hangs on nothing of its new side would be a body, or a void, of its own.

@@ -1,0 +1,112 @@
+//! The body nearest to a wish whose surface is a manifold: carved out of the hull.
+//!
+//! All cells inside are a body, the convex hull. From without, cells that are wished outside are taken off it as long as around every vertex
+//! inside and outside stay one piece each (Boissonnat, *Geometric structures for three-dimensional shape representation*, 1984): no wish, however
+//! wrong, makes a vertex wrong, and the body has no handle.
+
+use std::cmp::Ordering;
+use std::collections::BinaryHeap;
+
+use super::delaunay::Delaunay;
+use super::mend::{Ring, defect};
+use super::star::{Facets, Stars};
+
+/// A cell on the surface, and the radius of the widest of its facets there.
+#[derive(PartialEq)]
+struct Exposed(f32, u32);
+
+impl Eq for Exposed {}
+
+impl Ord for Exposed {
+    fn cmp(&self, other: &Self) -> Ordering {
+        self.0.total_cmp(&other.0).then(other.1.cmp(&self.1))
+    }
+}
+
+impl PartialOrd for Exposed {
+    fn partial_cmp(&self, other: &Self) -> Option<Ordering> {
+        Some(self.cmp(other))
+    }
+}
+
+struct Carver<'a> {
+    delaunay: &'a Delaunay,
+    stars: &'a Stars,
+    inside: Vec<bool>,
+    ring: Ring,
+}
+
+/// Which cells are inside the body nearest to the `wish`; ghosts are outside in both.
+///
+/// Vertices that the surface does not reach stay within; through holes and voids stay closed by a layer of cells.
+pub(super) fn carve(
+    delaunay: &Delaunay,
+    stars: &Stars,
+    facets: &Facets,
+    wish: &[bool],
+) -> Vec<bool> {
+    let cells = 0..wish.len() as u32;
+    let mut carver = Carver {
+        delaunay,
+        stars,
+        inside: cells.map(|c| !delaunay.is_ghost(c)).collect(),
+        ring: Ring::default(),
+    };
+    carver.take_off(facets, wish);
+    carver.inside
+}
+
+impl Carver<'_> {
+    /// Cells one by one, those under the widest facets first.
+    fn take_off(&mut self, facets: &Facets, wish: &[bool]) {
+        /// A cell that could not be taken off is tried again when others have gone; seldom more than twice.
+        const ROUNDS: usize = 8;
+        let cells = 0..self.inside.len() as u32;
+        let mut waiting: Vec<u32> = cells
+            .filter(|c| self.inside[*c as usize] && !wish[*c as usize])
+            .collect();
+        for _ in 0..ROUNDS {
+            let mut heap: BinaryHeap<Exposed> = (waiting.iter())
+                .filter_map(|c| self.exposed(facets, *c))
+                .collect();
+            let before = waiting.len();
+            while let Some(Exposed(_, cell)) = heap.pop() {
+                if self.inside[cell as usize] && self.try_without(cell) {
+                    for n in self.delaunay.neighbors[cell as usize] {
+                        if self.inside[n as usize] && !wish[n as usize] {
+                            heap.extend(self.exposed(facets, n));
+                        }
+                    }
+                }
+            }
+            waiting.retain(|c| self.inside[*c as usize]);
+            if waiting.len() == before {
+                break;
+            }
+        }
+    }
+
+    /// The cell, where a facet of it is on the surface.
+    fn exposed(&self, facets: &Facets, cell: u32) -> Option<Exposed> {
+        let beside = self.delaunay.neighbors[cell as usize];
+        let radii = (0..4)
+            .filter(|at| !self.inside[beside[*at] as usize])
+            .map(|at| facets.radius(cell, at));
+        radii.max_by(f32::total_cmp).map(|r| Exposed(r, cell))
+    }
+
+    /// Takes a cell off where that makes no vertex wrong that was right; whether it did.
+    fn try_without(&mut self, cell: u32) -> bool {
+        self.inside[cell as usize] = false;
+        let corners = self.delaunay.cells[cell as usize];
+        let is_right = corners.iter().all(|v| self.is_right_or_within(*v));
+        self.inside[cell as usize] = !is_right;
+        is_right
+    }
+
+    fn is_right_or_within(&mut self, v: u32) -> bool {
+        let star = self.stars.of(v);
+        star.iter().all(|code| self.inside[(code >> 2) as usize])
+            || defect(self.delaunay, self.stars, &self.inside, v, &mut self.ring) == 0
+    }
+}
