@@ -7,6 +7,8 @@ mod solids;
 #[path = "align/datums.rs"]
 mod datums;
 
+use std::path::Path;
+
 use acies::geometry::RigidTransform;
 use acies::geometry::fit::invert_spd;
 use acies::inspect::align::datum::{Datum, DatumError, pose_from_datums};
@@ -17,6 +19,7 @@ use acies::inspect::result::Verdict;
 use acies::nominal::Nominal;
 use acies::points::{Frame, Neighbors, PointCloud, noise_mm, spacing};
 use glam::{DMat3, DQuat, DVec2, DVec3};
+use nalgebra::{Matrix6, Vector6};
 use solids::{Noise, Solid};
 
 const SIGMA: f64 = 0.010;
@@ -153,6 +156,38 @@ fn covariances_are_honest_over_seeds() {
     }
     // 0.025 and 0.975 quantiles of chi-square with 96 degrees of freedom.
     assert!((70.8..125.0).contains(&sum), "{sum}");
+}
+
+/// A casting of planes, holes and fillets that pass smoothly into them, as drawn but for noise: no form is there, so that the stated
+/// covariance is that of the noise, of the nine tenths of the points that are used and of Tukey's weights.
+#[test]
+fn fillets_as_drawn_are_no_form() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("../shared/data/step/nist_ctc_03_asme1_ap242-e2.stp");
+    if !path.is_file() {
+        eprintln!("skipped: {} is not there", path.display());
+        return;
+    }
+    let nominal = Nominal::read(&path).expect("a part");
+    let area: f64 = nominal.faces.iter().map(|face| face.area_mm2()).sum();
+    let spacing_mm = (area / 200_000.0).sqrt();
+    let sigma = 0.1 * spacing_mm;
+    let mut noise = Noise(11);
+    let mut information = Matrix6::zeros();
+    let positions = Nominal::samples(&nominal, spacing_mm).into_iter().map(|s| {
+        let turn = s.point.cross(s.normal);
+        let row = Vector6::new(turn.x, turn.y, turn.z, s.normal.x, s.normal.y, s.normal.z);
+        information += row * row.transpose() / (sigma * sigma);
+        s.point + sigma * noise.normal() * s.normal
+    });
+    let cloud = PointCloud::from_positions(Frame::Machine, positions.collect());
+    let start = Start::Rough(RigidTransform::IDENTITY);
+    let found = aligned(&nominal, &cloud, start, &AlignOptions::default());
+    assert_eq!(found.conclusion, Conclusion::Good, "{:?}", found.findings);
+    let stated = Matrix6::from_fn(|i, j| found.alignment.covariance[i][j]);
+    let over_bound = (stated * information).trace() / 6.0;
+    // It was 11 when points were chosen by their noise, and fillets by where their planes meet.
+    assert!((1.0..1.5).contains(&over_bound), "{over_bound}");
 }
 
 #[test]

@@ -6,6 +6,7 @@ use glam::DVec3;
 use rayon::prelude::*;
 
 use super::body::{Body, BodySample};
+use crate::nominal::Foot;
 use crate::points::PointCloud;
 use crate::points::neighbors::Neighbors;
 
@@ -107,11 +108,26 @@ impl<'a, B: Body> Surface<'a, B> {
         gate_mm: f64,
         found: &mut Vec<(u32, f64)>,
     ) -> Place {
-        self.place_and_rim(p, towards, gate_mm, found).0
+        let mut best = Candidate::NONE;
+        for candidate in self.grid.candidates(p) {
+            let (index, middle) = sample_of(*candidate);
+            let limit = (best.place.distance_mm, middle);
+            if let Some(new) = self.candidate(p, &self.samples[index], towards, limit)
+                && new.place.distance_mm < best.place.distance_mm
+            {
+                best = new;
+            }
+        }
+        if best.inside && best.place.distance_mm <= gate_mm {
+            return best.place;
+        }
+        self.nearest_of_samples(p, towards, gate_mm, found)
     }
 
     /// As [`Surface::place`], with the distance of the foot from the nearest edge between its face and another one into which it
-    /// does not pass smoothly, mm, as far as faces near `p` tell: infinite in the middle of a face.
+    /// does not pass smoothly, mm, as far as faces near the foot tell: infinite in the middle of a face.
+    ///
+    /// All is asked of the foot, nothing of the point: what is chosen by the noise of the points is no longer free of bias.
     pub(super) fn place_and_rim(
         &self,
         p: DVec3,
@@ -119,31 +135,25 @@ impl<'a, B: Body> Surface<'a, B> {
         gate_mm: f64,
         found: &mut Vec<(u32, f64)>,
     ) -> (Place, f64) {
-        let mut best = Candidate::NONE;
+        let place = self.place(p, towards, gate_mm, found);
         let mut rim = f64::INFINITY;
-        for candidate in self.grid.candidates(p) {
-            let (index, middle) = sample_of(*candidate);
-            let limit = (best.place.distance_mm, middle);
-            let Some(new) = self.candidate(p, &self.samples[index], towards, limit) else {
+        if place.face == NO_FACE {
+            return (place, rim);
+        }
+        let on = p - place.deviation_mm * place.normal;
+        for candidate in self.grid.candidates(on) {
+            let sample = &self.samples[sample_of(*candidate).0];
+            if sample.face == place.face || self.pass_smoothly(sample.face, place.face) {
+                continue;
+            }
+            let Some(foot) = self.body.foot(sample.face, on, Some(sample.uv)) else {
                 continue;
             };
-            let (kept, other) = if new.place.distance_mm < best.place.distance_mm {
-                (new, best)
-            } else {
-                (best, new)
-            };
-            best = kept;
-            if other.place.face != NO_FACE && other.place.face != best.place.face {
-                let distance = distance_of_edge(&best.place, &other.place);
-                if distance < rim && !self.pass_smoothly(best.place.face, other.place.face) {
-                    rim = distance;
-                }
+            if towards.is_none_or(|t| t.dot(foot.normal) >= HORIZON) {
+                rim = rim.min(distance_of_edge(place.normal, on, &foot));
             }
         }
-        if best.inside && best.place.distance_mm <= gate_mm {
-            return (best.place, rim);
-        }
-        (self.nearest_of_samples(p, towards, gate_mm, found), rim)
+        (place, rim)
     }
 
     fn pass_smoothly(&self, a: u32, b: u32) -> bool {
@@ -243,16 +253,15 @@ impl Candidate {
     };
 }
 
-/// Distance of the foot of a point on one face from where its plane there meets the plane of another face; infinite where they are
-/// tangent to each other. Of the foot, not of the point: what is chosen by the noise of the points is no longer free of bias.
-fn distance_of_edge(on: &Place, other: &Place) -> f64 {
-    let sine = on.normal.cross(other.normal).length();
+/// Distance of the place `on` of one face, of this normal there, from where its plane meets the plane of another face at the foot
+/// of `on`; infinite where they are tangent to each other.
+fn distance_of_edge(normal: DVec3, on: DVec3, other: &Foot) -> f64 {
+    let sine = normal.cross(other.normal).length();
     // Below 5 degrees an edge is none: see the nominal's sharp edges.
     if sine < 0.0872 {
         return f64::INFINITY;
     }
-    let of_foot = other.deviation_mm - on.deviation_mm * on.normal.dot(other.normal);
-    of_foot.abs() / sine
+    (on - other.point).dot(other.normal).abs() / sine
 }
 
 /// The direction from which point `i` was seen, where it is known.
