@@ -1,13 +1,14 @@
 //! A host whose reading thread is kept from its work for a while, as by a busy machine: with the transfers in flight that its way of reading has.
 
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use acies_drivers::error::LinkError;
 use acies_drivers::link::usb::{OneByOne, Request, UsbInterface, UsbLink, UsbStream, UsbTarget};
 use acies_drivers::link::{Link, Links, Target};
 
-use crate::rig::SOON;
+/// Longest wait for the reading thread to come to a stand; long because the machine may be busy.
+const SOON: Duration = Duration::from_secs(30);
 
 /// Links to such a host.
 pub struct Hesitant<'a> {
