@@ -26,7 +26,13 @@ pub enum Match {
 /// Longer than any keep-alive's interval of ours, so that a start is never passed over while the caller still makes ready.
 const OTHERS_WRITE: Duration = Duration::from_secs(3);
 
-/// Opens the links of a recording, each once. A link is found by its target's name, or else the next in the order of opening is taken: a
+/// Recorded times are counted from so much ahead of now: nothing that is played back seems to be late, however slowly it goes.
+const AHEAD: Duration = Duration::from_secs(3600);
+
+/// Opens the links of a recording, each once. What came has the time at which it came then ([`Link::received`]), to the nanosecond, though it is
+/// played back as fast as it is taken.
+///
+/// A link is found by its target's name, or else the next in the order of opening is taken: a
 /// device may have another address than it had.
 pub struct Replay {
     shared: Arc<Shared>,
@@ -34,6 +40,8 @@ pub struct Replay {
 
 struct Shared {
     matching: Match,
+    /// The moment that the recording's times are counted from.
+    began: Instant,
     written: Condvar,
     tape: Mutex<Tape>,
 }
@@ -64,14 +72,22 @@ struct Opening {
 struct Cursor {
     records: VecDeque<usize>,
     byte: usize,
+    /// Time of the last record that was given out.
+    came: Duration,
 }
 
 impl Replay {
     /// Plays `recording` to those who open its links; for everyone after that it is [`LinkError::Busy`].
     pub fn new(recording: Recording, matching: Match) -> Replay {
+        Replay::of_run(recording, matching, Instant::now())
+    }
+
+    /// As [`Replay::new`], for one of several devices of a run: with the same `began` for all, their times are by one clock as they were.
+    pub fn of_run(recording: Recording, matching: Match, began: Instant) -> Replay {
         Replay {
             shared: Arc::new(Shared {
                 matching,
+                began: began + AHEAD,
                 written: Condvar::new(),
                 tape: Mutex::new(Tape::new(recording)),
             }),
@@ -230,6 +246,12 @@ impl Shared {
         }
     }
 
+    fn received(&self, channel: u8) -> Instant {
+        let tape = self.lock();
+        let came = tape.channels.get(&channel).map(|cursor| cursor.came);
+        self.began + came.unwrap_or_default()
+    }
+
     fn write(&self, channel: u8, bytes: &[u8]) -> Result<(), LinkError> {
         let mut tape = self.lock();
         if self.matching == Match::Exact {
@@ -275,6 +297,7 @@ impl Link for Played {
             let n = rest.len().min(buffer.len());
             buffer[..n].copy_from_slice(&rest[..n]);
             cursor.byte += n;
+            cursor.came = records[i].time;
             if n == rest.len() {
                 cursor.records.pop_front();
                 cursor.byte = 0;
@@ -284,6 +307,10 @@ impl Link for Played {
             }
             tape = held;
         }
+    }
+
+    fn received(&self) -> Instant {
+        self.shared.received(self.channel)
     }
 
     fn write(&self, bytes: &[u8], _: Instant) -> Result<(), LinkError> {
@@ -313,11 +340,10 @@ impl PlayedUsb {
             Next::Nothing => return Ok(None),
             Next::Over => return Err(LinkError::Gone),
         };
-        tape.channels
-            .entry(channel)
-            .or_default()
-            .records
-            .pop_front();
+        let came = tape.records[i].time;
+        let cursor = tape.channels.entry(channel).or_default();
+        cursor.records.pop_front();
+        cursor.came = came;
         let record = &tape.records[i];
         match (record.kind, &record.bytes[..]) {
             (Kind::Failed, [2]) => Err(LinkError::Overflow),
@@ -395,6 +421,10 @@ impl UsbLink for PlayedUsb {
         deadline: Instant,
     ) -> Result<Option<usize>, LinkError> {
         self.transfer(self.channel_of(endpoint), buffer, deadline)
+    }
+
+    fn received(&self, endpoint: u8) -> Instant {
+        self.shared.received(self.channel_of(endpoint))
     }
 
     fn write(&self, endpoint: u8, bytes: &[u8], _: Instant) -> Result<Option<usize>, LinkError> {
