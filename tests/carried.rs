@@ -743,12 +743,11 @@ fn a_lag_that_nothing_shows_is_said_to_be_open() {
 /// How old the sensor's picture is when it is stamped, s.
 const OLD_S: f64 = 0.020;
 
-/// A ball under a robot that goes to and fro every six seconds, and a sensor whose picture of it is [`OLD_S`] old: the cell's file, and the devices
+/// A ball under a robot that first rests and then goes to and fro every six seconds, and a sensor whose picture of it is [`OLD_S`] old: the cell's file, and the devices
 /// that must live.
-fn lagging_cell(test: &str) -> (std::path::PathBuf, impl Sized) {
-    let path = |t: f64| {
-        // It rests until the program has opened the devices.
-        let within = (t - 4.0).max(0.0) % 6.0;
+fn lagging_cell(test: &str, rests_s: f64) -> (std::path::PathBuf, impl Sized) {
+    let path = move |t: f64| {
+        let within = (t - rests_s).max(0.0) % 6.0;
         let down = pose::Pose::turn_about(DVec3::ZERO, DVec3::X, std::f64::consts::PI);
         let there = eased(within / 2.0) - eased((within - 2.0) / 2.0);
         pose::Pose::shift(DVec3::new(400.0, 100.0 + 100.0 * there, 300.0)).after(down)
@@ -829,7 +828,8 @@ fn asked_again(mut ask: impl FnMut(usize) -> std::process::Output) -> std::proce
 
 #[test]
 fn the_command_finds_the_lag_of_simulated_devices() {
-    let (cell, _devices) = lagging_cell("lag");
+    // It rests until the program has opened the devices.
+    let (cell, _devices) = lagging_cell("lag", 4.0);
     let cell = cell.display().to_string();
     let run =
         asked_again(|_| acies(&["calibrate", "--lag", "2", "--radius", "20", "--json", &cell]));
@@ -847,7 +847,7 @@ fn the_command_finds_the_lag_of_simulated_devices() {
 /// Recorded today, found tomorrow: from the files alone, the same bits every time, and only where both devices were recorded by one clock.
 #[test]
 fn the_command_finds_the_lag_in_recordings() {
-    let (cell, devices) = lagging_cell("lag-recorded");
+    let (cell, devices) = lagging_cell("lag-recorded", 0.0);
     let folder = cell.parent().expect("its folder").to_owned();
     let cell = cell.display().to_string();
     let pass = |name: String| folder.join(name).display().to_string();
@@ -864,11 +864,12 @@ fn the_command_finds_the_lag_in_recordings() {
         folders = ["a", "b"].map(|of| pass(format!("{of}-{again}"))).to_vec();
         for folder in &folders {
             let run = acies(&["record", &cell, "--all", "--seconds", "6.5", "-o", folder]);
-            let told = String::from_utf8_lossy(&run.stdout);
-            assert!(
-                run.status.success() && told.contains(" poses; missing"),
-                "{told}"
+            let (said, told) = (
+                String::from_utf8_lossy(&run.stdout),
+                String::from_utf8_lossy(&run.stderr),
             );
+            let whole = run.status.success() && said.contains(" poses; missing");
+            assert!(whole, "{said}{told}");
         }
         calibrate(&[&folders[0], &folders[1]])
     });
