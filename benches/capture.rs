@@ -227,9 +227,9 @@ fn link_alone(name: &str, (target, device): Bare, seconds: f64) {
     let mut buffer = [0; BYTES];
     let mut late = Vec::new();
     let mut read = 0;
-    while !writer.is_finished() {
-        let until = Instant::now() + Duration::from_millis(100);
-        read += link.read(&mut buffer, until).expect("a link");
+    // Until the device is gone.
+    while let Ok(n) = link.read(&mut buffer, Instant::now() + Duration::from_millis(100)) {
+        read += n;
         if read >= BYTES {
             let now = link.received();
             read -= BYTES;
@@ -237,6 +237,7 @@ fn link_alone(name: &str, (target, device): Bare, seconds: f64) {
             late.push(now.saturating_duration_since(sent));
         }
     }
+    writer.join().expect("the device");
     let (median, worst) = median_and_worst(&mut late);
     println!(
         "{name}: {} messages, from the device's write to the reader: median {median:?}, worst {worst:?}",
