@@ -62,6 +62,11 @@ pub const CASES: &[Case] = &[
         run: unplugged_in_a_scan_and_back,
     },
     Case {
+        name: "unplugged_while_it_is_opened",
+        devices: examples,
+        run: unplugged_while_it_is_opened,
+    },
+    Case {
         name: "the_laser_goes_off",
         devices: sound,
         run: the_laser_goes_off,
@@ -485,6 +490,27 @@ fn unplugged_in_a_scan_and_back(rig: &dyn Rig, _: usize) {
     let mut profiler = open(rig, "");
     let profiles = scan(profiler.as_mut(), 20).expect("a scan after plugging in again");
     assert_eq!(profiles[0].sequence, 0);
+}
+
+/// The cable is pulled after each number of transfers that opening takes; afterwards it opens all the same.
+fn unplugged_while_it_is_opened(rig: &dyn Rig, variant: usize) {
+    let driver = ["u3v-profiler", "usb-itn"][variant];
+    let mut told = 0;
+    for transfers in 0.. {
+        let host = Hesitant::pulled_after(rig.links(), transfers);
+        let Err(error) = open_over(&host, driver, "") else {
+            break;
+        };
+        assert!(
+            error.may_pass() && text(&error).ends_with("plug it in again and reopen"),
+            "{transfers}: {}",
+            text(&error)
+        );
+        told += 1;
+    }
+    assert!(told > 1, "{told}");
+    let mut again = open_with(rig, driver, "").unwrap_or_else(|error| panic!("{}", text(&error)));
+    assert!(scan(again.as_mut(), 2).is_ok());
 }
 
 fn the_laser_goes_off(rig: &dyn Rig, _: usize) {

@@ -1,5 +1,7 @@
-//! A host whose reading thread is kept from its work for a while, as by a busy machine: with the transfers in flight that its way of reading has.
+//! A host whose reading thread is kept from its work for a while, as by a busy machine: with the transfers in flight that its way of reading has; and
+//! one whose cable is pulled after so many transfers.
 
+use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
@@ -16,6 +18,8 @@ pub struct Hesitant<'a> {
     gate: Arc<Gate>,
     /// Streams have one transfer in flight at a time.
     single: bool,
+    /// Transfers before the cable is pulled.
+    left: Arc<AtomicU32>,
 }
 
 #[derive(Default)]
@@ -40,6 +44,15 @@ impl<'a> Hesitant<'a> {
             links,
             gate: Arc::default(),
             single,
+            left: Arc::new(AtomicU32::new(u32::MAX)),
+        }
+    }
+
+    /// Whose cable is pulled after so many transfers.
+    pub fn pulled_after(links: &'a dyn Links, transfers: u32) -> Hesitant<'a> {
+        Hesitant {
+            left: Arc::new(AtomicU32::new(transfers)),
+            ..Hesitant::new(links, false)
         }
     }
 
@@ -90,6 +103,7 @@ impl Links for Hesitant<'_> {
             link: self.links.open_usb(target)?,
             gate: Arc::clone(&self.gate),
             single: self.single,
+            left: Arc::clone(&self.left),
         }))
     }
 }
@@ -98,6 +112,21 @@ struct Hesitating {
     link: Arc<dyn UsbLink>,
     gate: Arc<Gate>,
     single: bool,
+    left: Arc<AtomicU32>,
+}
+
+impl Hesitating {
+    /// One transfer more, where the cable is in.
+    fn plugged(&self) -> Result<&dyn UsbLink, LinkError> {
+        let fewer = |left: u32| left.checked_sub(1);
+        let before = self
+            .left
+            .fetch_update(Ordering::AcqRel, Ordering::Acquire, fewer);
+        match before {
+            Ok(_) => Ok(self.link.as_ref()),
+            Err(_) => Err(LinkError::Gone),
+        }
+    }
 }
 
 type Passed = Result<Option<usize>, LinkError>;
@@ -112,19 +141,19 @@ impl UsbLink for Hesitating {
     }
 
     fn control_in(&self, request: Request, buffer: &mut [u8], deadline: Instant) -> Passed {
-        self.link.control_in(request, buffer, deadline)
+        self.plugged()?.control_in(request, buffer, deadline)
     }
 
     fn control_out(&self, request: Request, bytes: &[u8], deadline: Instant) -> Passed {
-        self.link.control_out(request, bytes, deadline)
+        self.plugged()?.control_out(request, bytes, deadline)
     }
 
     fn read(&self, endpoint: u8, buffer: &mut [u8], deadline: Instant) -> Passed {
-        self.link.read(endpoint, buffer, deadline)
+        self.plugged()?.read(endpoint, buffer, deadline)
     }
 
     fn write(&self, endpoint: u8, bytes: &[u8], deadline: Instant) -> Passed {
-        self.link.write(endpoint, bytes, deadline)
+        self.plugged()?.write(endpoint, bytes, deadline)
     }
 
     fn stream(
