@@ -18,7 +18,7 @@ pub enum Match {
     /// Every write must be the recorded one, byte for byte. For drivers that ask and wait.
     Exact,
     /// Any write passes. A recorded write that the driver does not repeat within this time is passed over: keep-alives come
-    /// at other moments than they were recorded.
+    /// at other moments than they were recorded, and fewer of them, because a recording is played back faster.
     Loose(Duration),
 }
 
@@ -51,12 +51,23 @@ struct Tape {
     records: Vec<Record>,
     /// For each record, how many recorded writes lie before it.
     writes_before: Vec<usize>,
-    /// Indices of the recorded writes.
-    writes: Vec<usize>,
+    /// The recorded writes.
+    writes: Vec<Write>,
     openings: Vec<Opening>,
     channels: BTreeMap<u8, Cursor>,
     /// Writes of the driver, and recorded ones that were passed over.
     credit: usize,
+}
+
+/// A recorded write.
+struct Write {
+    /// Its index among the records.
+    record: usize,
+    /// The write before it on its channel.
+    before: Option<usize>,
+    /// The one before or behind it on its channel is the same: a keep-alive, which data on other channels need not wait for.
+    repeated: bool,
+    passed_over: bool,
 }
 
 /// A link that was opened when the recording was made.
@@ -129,7 +140,23 @@ impl Tape {
         for (i, record) in tape.records.iter().enumerate() {
             tape.writes_before.push(tape.writes.len());
             match record.kind {
-                Kind::ToDevice => tape.writes.push(i),
+                Kind::ToDevice => {
+                    let of_channel =
+                        |write: &Write| tape.records[write.record].channel == record.channel;
+                    let before = tape.writes.iter().rposition(of_channel);
+                    let repeated = before.is_some_and(|before| {
+                        let before = &mut tape.writes[before];
+                        let same = tape.records[before.record].bytes == record.bytes;
+                        before.repeated |= same;
+                        same
+                    });
+                    tape.writes.push(Write {
+                        record: i,
+                        before,
+                        repeated,
+                        passed_over: false,
+                    });
+                }
                 Kind::Opened => tape.openings.push(Opening {
                     channel: record.channel,
                     name: String::from_utf8_lossy(&record.bytes).into_owned(),
@@ -170,6 +197,49 @@ impl Tape {
             opening.channel,
             opening.interfaces.clone().unwrap_or_default(),
         ))
+    }
+
+    /// The keep-alive that is next was not written by the driver. Of the answers to such ones only the last is kept, should one be asked for after all.
+    fn pass_over(&mut self) {
+        let write = &mut self.writes[self.credit];
+        write.passed_over = true;
+        let (record, before) = (write.record, write.before);
+        self.credit += 1;
+        let Some(before) = before.map(|before| &self.writes[before]) else {
+            return;
+        };
+        if let Some(cursor) = self.channels.get_mut(&self.records[record].channel)
+            && before.passed_over
+        {
+            let answered = before.record..record;
+            cursor.records.retain(|i| !answered.contains(i));
+        }
+    }
+
+    /// The driver wrote: the recorded write that this is, with the keep-alives before it that did not come.
+    fn written(&mut self, channel: u8, bytes: &[u8]) {
+        let is_this = |write: &Write| {
+            let record = &self.records[write.record];
+            record.channel == channel && record.bytes == bytes
+        };
+        let ahead = self.writes.get(self.credit..).unwrap_or_default();
+        let this = ahead
+            .iter()
+            .position(|write| is_this(write) || !write.repeated);
+        match this.map(|place| self.credit + place) {
+            Some(place) if is_this(&self.writes[place]) => {
+                while self.credit < place {
+                    self.pass_over();
+                }
+                self.credit += 1;
+            }
+            // One more keep-alive than there were: no other command is taken for it.
+            _ if self
+                .writes
+                .iter()
+                .any(|write| write.repeated && is_this(write)) => {}
+            _ => self.credit += 1,
+        }
     }
 
     /// Nothing is left that any channel could give.
@@ -213,20 +283,22 @@ impl Shared {
                     };
                 }
                 Some(i) => {
-                    let awaited = tape.writes[tape.credit];
-                    let own = tape.records[awaited].channel == channel;
+                    let awaited = &tape.writes[tape.credit];
+                    let own = tape.records[awaited.record].channel == channel;
+                    let repeated = awaited.repeated;
                     let patience = match self.matching {
                         Match::Exact => None,
-                        Match::Loose(patience) if own => Some(patience),
+                        Match::Loose(patience) if own || repeated => Some(patience),
                         Match::Loose(patience) => Some(patience.max(OTHERS_WRITE)),
                     };
                     let until = patience.map(|patience| began + patience);
                     if until.is_some_and(|until| Instant::now() >= until) {
                         // Up to here, or to the next one of another channel.
-                        tape.credit = match own {
-                            true => tape.credit + 1,
-                            false => tape.writes_before[i],
-                        };
+                        match (own, repeated) {
+                            (false, true) => tape.pass_over(),
+                            (true, _) => tape.credit += 1,
+                            (false, false) => tape.credit = tape.writes_before[i],
+                        }
                         self.written.notify_all();
                         continue;
                     }
@@ -255,11 +327,11 @@ impl Shared {
     fn write(&self, channel: u8, bytes: &[u8]) -> Result<(), LinkError> {
         let mut tape = self.lock();
         if self.matching == Match::Exact {
-            let at = tape.writes.get(tape.credit).ok_or(LinkError::Gone)?;
-            let record = &tape.records[*at];
+            let at = tape.writes.get(tape.credit).ok_or(LinkError::Gone)?.record;
+            let record = &tape.records[at];
             // What was recorded before it has been read.
             let cursor = tape.channels.get(&record.channel);
-            let read = cursor.is_none_or(|c| c.records.front().is_none_or(|first| first > at));
+            let read = cursor.is_none_or(|c| c.records.front().is_none_or(|first| *first > at));
             if !read || record.bytes != bytes || record.channel != channel {
                 return Err(LinkError::Departed {
                     found: hex(bytes),
@@ -268,7 +340,10 @@ impl Shared {
                 });
             }
         }
-        tape.credit += 1;
+        match self.matching {
+            Match::Exact => tape.credit += 1,
+            Match::Loose(_) => tape.written(channel, bytes),
+        }
         self.written.notify_all();
         Ok(())
     }
