@@ -65,9 +65,19 @@ struct Write {
     record: usize,
     /// The write before it on its channel.
     before: Option<usize>,
-    /// The one before or behind it on its channel is the same: a keep-alive, which data on other channels need not wait for.
+    /// The one before or behind it on its channel is the same.
     repeated: bool,
+    /// The next that passed on its channel came from the device.
+    answered: bool,
     passed_over: bool,
+}
+
+impl Write {
+    /// Data on other channels need not wait for it: it is said again and again, and what it asks for comes on its own channel. A question that is
+    /// answered elsewhere is none.
+    fn is_keep_alive(&self) -> bool {
+        self.repeated && self.answered
+    }
 }
 
 /// A link that was opened when the recording was made.
@@ -137,13 +147,13 @@ impl Tape {
             channels: BTreeMap::new(),
             credit: 0,
         };
+        // The last write of each channel.
+        let mut last: BTreeMap<u8, usize> = BTreeMap::new();
         for (i, record) in tape.records.iter().enumerate() {
             tape.writes_before.push(tape.writes.len());
             match record.kind {
                 Kind::ToDevice => {
-                    let of_channel =
-                        |write: &Write| tape.records[write.record].channel == record.channel;
-                    let before = tape.writes.iter().rposition(of_channel);
+                    let before = last.insert(record.channel, tape.writes.len());
                     let repeated = before.is_some_and(|before| {
                         let before = &mut tape.writes[before];
                         let same = tape.records[before.record].bytes == record.bytes;
@@ -154,6 +164,7 @@ impl Tape {
                         record: i,
                         before,
                         repeated,
+                        answered: false,
                         passed_over: false,
                     });
                 }
@@ -170,6 +181,9 @@ impl Tape {
                 }
                 Kind::Note => {}
                 Kind::FromDevice | Kind::Gone | Kind::Limit | Kind::Failed => {
+                    if let Some(write) = last.get(&record.channel) {
+                        tape.writes[*write].answered = true;
+                    }
                     let cursor = tape.channels.entry(record.channel).or_default();
                     cursor.records.push_back(i);
                 }
@@ -211,8 +225,10 @@ impl Tape {
         if let Some(cursor) = self.channels.get_mut(&self.records[record].channel)
             && before.passed_over
         {
-            let answered = before.record..record;
-            cursor.records.retain(|i| !answered.contains(i));
+            let answers = before.record..record;
+            while cursor.records.front().is_some_and(|i| answers.contains(i)) {
+                cursor.records.pop_front();
+            }
         }
     }
 
@@ -225,7 +241,7 @@ impl Tape {
         let ahead = self.writes.get(self.credit..).unwrap_or_default();
         let this = ahead
             .iter()
-            .position(|write| is_this(write) || !write.repeated);
+            .position(|write| is_this(write) || !write.is_keep_alive());
         match this.map(|place| self.credit + place) {
             Some(place) if is_this(&self.writes[place]) => {
                 while self.credit < place {
@@ -237,7 +253,7 @@ impl Tape {
             _ if self
                 .writes
                 .iter()
-                .any(|write| write.repeated && is_this(write)) => {}
+                .any(|write| write.is_keep_alive() && is_this(write)) => {}
             _ => self.credit += 1,
         }
     }
@@ -285,16 +301,16 @@ impl Shared {
                 Some(i) => {
                     let awaited = &tape.writes[tape.credit];
                     let own = tape.records[awaited.record].channel == channel;
-                    let repeated = awaited.repeated;
+                    let kept_alive = awaited.is_keep_alive();
                     let patience = match self.matching {
                         Match::Exact => None,
-                        Match::Loose(patience) if own || repeated => Some(patience),
+                        Match::Loose(patience) if own || kept_alive => Some(patience),
                         Match::Loose(patience) => Some(patience.max(OTHERS_WRITE)),
                     };
                     let until = patience.map(|patience| began + patience);
                     if until.is_some_and(|until| Instant::now() >= until) {
                         // Up to here, or to the next one of another channel.
-                        match (own, repeated) {
+                        match (own, kept_alive) {
                             (false, true) => tape.pass_over(),
                             (true, _) => tape.credit += 1,
                             (false, false) => tape.credit = tape.writes_before[i],
