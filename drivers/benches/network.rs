@@ -20,6 +20,7 @@ use acies_simulators::u3v;
 use acies_simulators::usb::Socket;
 use acies_simulators::usb::preload::{Carrier, library};
 
+#[allow(dead_code)] // the tests use more of it
 #[path = "../tests/usb/hesitant.rs"]
 mod hesitant;
 
