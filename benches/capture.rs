@@ -35,10 +35,9 @@ const CHILD: &str = "ACIES_BENCH_USB";
 
 fn main() {
     if let Ok(seconds) = std::env::var(CHILD) {
-        let table = format!(
-            "first_block = 0\nencoder_step = 10\nfeatures = [['PixelFormat', 'Coord3D_C16']]"
-        );
-        return into_the_scan("u3v-profiler", &table, seconds.parse().expect("seconds"));
+        let table =
+            "first_block = 0\nencoder_step = 10\nfeatures = [['PixelFormat', 'Coord3D_C16']]";
+        return into_the_scan("u3v-profiler", table, seconds.parse().expect("seconds"));
     }
     let seconds = std::env::args().find_map(|word| word.parse().ok());
     let seconds = seconds.unwrap_or(10.0);
