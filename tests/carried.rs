@@ -21,6 +21,7 @@ use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::cable::Cable;
+use acies_drivers::link::recording::Recording;
 use acies_simulators::carried::{Motion, eased};
 use acies_simulators::demo_cell::DemoCell;
 use acies_simulators::gocator::{Form, SimulatedGocator, Surface};
@@ -739,13 +740,14 @@ fn a_lag_that_nothing_shows_is_said_to_be_open() {
     assert!(told.contains("no sphere of radius 15 mm among"), "{told}");
 }
 
-/// A ball under a robot that goes to and fro every six seconds, and a sensor whose picture of it is 20 ms old.
-#[test]
-fn the_command_finds_the_lag_of_simulated_devices() {
-    const OLD_S: f64 = 0.020;
-    let path = |t: f64| {
-        // It rests until the program has opened the devices.
-        let within = (t - 4.0).max(0.0) % 6.0;
+/// How old the sensor's picture is when it is stamped, s.
+const OLD_S: f64 = 0.020;
+
+/// A ball under a robot that first rests and then goes to and fro every six seconds, and a sensor whose picture of it is [`OLD_S`] old: the cell's file, and the devices
+/// that must live.
+fn lagging_cell(test: &str, rests_s: f64) -> (std::path::PathBuf, impl Sized) {
+    let path = move |t: f64| {
+        let within = (t - rests_s).max(0.0) % 6.0;
         let down = pose::Pose::turn_about(DVec3::ZERO, DVec3::X, std::f64::consts::PI);
         let there = eased(within / 2.0) - eased((within - 2.0) / 2.0);
         pose::Pose::shift(DVec3::new(400.0, 100.0 + 100.0 * there, 300.0)).after(down)
@@ -770,7 +772,8 @@ fn the_command_finds_the_lag_of_simulated_devices() {
         ..gocator::Setup::new(13_434, Surface::Carried(Box::new(view), Arc::clone(&seen)))
     })
     .expect("a sensor");
-    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("lag");
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join(test);
+    let _ = std::fs::remove_dir_all(&folder);
     std::fs::create_dir_all(&folder).expect("a folder");
     let example = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("configs");
     let text =
@@ -789,37 +792,114 @@ fn the_command_finds_the_lag_of_simulated_devices() {
     let now = Instant::now();
     tool.go(now);
     seen.go(now);
-    let asked = || {
-        std::process::Command::new(env!("CARGO_BIN_EXE_acies"))
-            .args(["calibrate", "--lag", "2", "--radius", "20", "--json"])
-            .arg(&cell)
-            .output()
-            .expect("the program")
-    };
-    // Everything goes by the clock: where this machine is busy otherwise the program says that the lag stays open, and is asked again.
+    (cell, (robot, line))
+}
+
+fn acies(arguments: &[&str]) -> std::process::Output {
+    std::process::Command::new(env!("CARGO_BIN_EXE_acies"))
+        .args(arguments)
+        .output()
+        .expect("the program")
+}
+
+/// The lag that the program printed, where it found one.
+fn printed_lag(run: &std::process::Output) -> (f64, f64, usize) {
+    let told = String::from_utf8_lossy(&run.stderr);
+    assert!(run.status.success(), "{told}");
+    let lag: serde_json::Value = serde_json::from_slice(&run.stdout).expect("JSON");
+    let number = |key: &str| lag[key].as_f64().expect("a number");
+    let passes = lag["passes"].as_array().expect("passes").len();
+    (number("lag_s"), number("u_s"), passes)
+}
+
+/// Everything goes by the clock: where this machine is busy otherwise the program says that the lag stays open, and is asked again.
+fn asked_again(mut ask: impl FnMut(usize) -> std::process::Output) -> std::process::Output {
     let open = |run: &std::process::Output| {
         String::from_utf8_lossy(&run.stderr).contains("the lag stays open")
     };
-    let mut run = asked();
-    for _ in 0..2 {
+    let mut run = ask(0);
+    for again in 1..3 {
         if open(&run) {
-            run = asked();
+            run = ask(again);
         }
     }
+    run
+}
+
+#[test]
+fn the_command_finds_the_lag_of_simulated_devices() {
+    // It rests until the program has opened the devices.
+    let (cell, _devices) = lagging_cell("lag", 4.0);
+    let cell = cell.display().to_string();
+    let run =
+        asked_again(|_| acies(&["calibrate", "--lag", "2", "--radius", "20", "--json", &cell]));
     let told = String::from_utf8_lossy(&run.stderr);
-    assert!(run.status.success(), "{told}");
     assert!(
         told.contains("pass 2 of 2: start the robot's program"),
         "{told}"
     );
-    let lag: serde_json::Value = serde_json::from_slice(&run.stdout).expect("JSON");
-    let (lag_s, u_s) = (lag["lag_s"].as_f64().unwrap(), lag["u_s"].as_f64().unwrap());
+    let (lag_s, u_s, passes) = printed_lag(&run);
     // What the two links' least delays may differ by.
-    assert!((lag_s + OLD_S).abs() < LEAST_DELAY_S, "{lag}");
-    assert!(
-        u_s < LEAST_DELAY_S && lag["passes"].as_array().unwrap().len() == 2,
-        "{lag}"
-    );
+    assert!((lag_s + OLD_S).abs() < LEAST_DELAY_S, "{lag_s}");
+    assert!(u_s < LEAST_DELAY_S && passes == 2, "{u_s}");
+}
+
+/// Recorded today, found tomorrow: from the files alone, the same bits every time, and only where both devices were recorded by one clock.
+#[test]
+fn the_command_finds_the_lag_in_recordings() {
+    let (cell, devices) = lagging_cell("lag-recorded", 0.0);
+    let folder = cell.parent().expect("its folder").to_owned();
+    let cell = cell.display().to_string();
+    let pass = |name: String| folder.join(name).display().to_string();
+    let calibrate = |folders: &[&str]| {
+        let mut arguments = vec!["calibrate", &cell, "--radius", "20", "--json"];
+        let each = folders
+            .iter()
+            .flat_map(|folder| ["--lag-recording", folder]);
+        arguments.extend(each);
+        acies(&arguments)
+    };
+    let mut folders = Vec::new();
+    let run = asked_again(|again| {
+        folders = ["a", "b"].map(|of| pass(format!("{of}-{again}"))).to_vec();
+        for folder in &folders {
+            let run = acies(&["record", &cell, "--all", "--seconds", "6.5", "-o", folder]);
+            let (said, told) = (
+                String::from_utf8_lossy(&run.stdout),
+                String::from_utf8_lossy(&run.stderr),
+            );
+            let whole = run.status.success() && said.contains(" poses; missing");
+            assert!(whole, "{said}{told}");
+        }
+        calibrate(&[&folders[0], &folders[1]])
+    });
+    drop(devices);
+    let (lag_s, u_s, passes) = printed_lag(&run);
+    assert!((lag_s + OLD_S).abs() < LEAST_DELAY_S, "{lag_s}");
+    assert!(u_s < LEAST_DELAY_S && passes == 2, "{u_s}");
+    assert_eq!(calibrate(&[&folders[0], &folders[1]]).stdout, run.stdout);
+    // The robot of the one pass and the profiler of the other.
+    let mixed = pass("mixed".into());
+    std::fs::create_dir_all(&mixed).expect("a folder");
+    for (number, folder) in folders.iter().enumerate() {
+        for entry in std::fs::read_dir(folder).expect("a folder") {
+            let path = entry.expect("an entry").path();
+            let recording = Recording::read(&path).expect("a recording");
+            let of_robot = recording.note("device ").as_deref() == Some("arm");
+            if of_robot == (number == 0) {
+                let name = path.file_name().expect("a name");
+                std::fs::copy(&path, std::path::Path::new(&mixed).join(name)).expect("a copy");
+            }
+        }
+    }
+    let told = calibrate(&[&mixed]);
+    let told = String::from_utf8_lossy(&told.stderr).into_owned();
+    assert!(told.contains("were not recorded at once"), "{told}");
+    let empty = pass("empty".into());
+    std::fs::create_dir_all(&empty).expect("a folder");
+    let told = calibrate(&[&empty]);
+    let told = String::from_utf8_lossy(&told.stderr).into_owned();
+    assert!(told.contains("0 recordings of arm, expected one"), "{told}");
 }
 
 // ---- A whole inspection -----------------------------------------------------------------------------------------------

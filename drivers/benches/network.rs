@@ -1,27 +1,30 @@
 //! Speed of the network and USB drivers: decoding alone, and sustained reception from simulated devices on the same computer.
 //!
 //! `cargo bench -p acies-drivers --bench network` takes ten seconds a device, `ACIES_BENCH_SECONDS=60` as many as it says. The device is played by the same
-//! computer, so that its share of the processor is in the figures.
+//! computer, so that its share of the processor is in the figures. `-- decoding`, `tcp`, `usb` or `hesitating` runs one part alone.
 
 use std::hint::black_box;
 use std::io::Write;
-use std::process::Command;
-use std::sync::Arc;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use acies_drivers::ALL;
 use acies_drivers::device::{Instrument, Profiler};
-use acies_drivers::error::LinkError;
 use acies_drivers::gocator::message::{Content, Decoder, message};
 use acies_drivers::ippdme::line;
+use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
-use acies_drivers::link::usb::{OneByOne, Request, UsbInterface, UsbLink, UsbStream, UsbTarget};
-use acies_drivers::link::{Link, Links, Target};
 use acies_drivers::u3v_profiler::block::{Geometry, pixel, points_mm};
 use acies_simulators::gocator::{Form, Setup, SimulatedGocator, Surface};
 use acies_simulators::u3v;
 use acies_simulators::usb::Socket;
 use acies_simulators::usb::preload::{Carrier, library};
+
+#[allow(dead_code)] // the tests use more of it
+#[path = "../tests/usb/hesitant.rs"]
+mod hesitant;
+
+use hesitant::Hesitant;
 
 const COLUMNS: u32 = 1280;
 const CHILD: &str = "ACIES_BENCH_USB";
@@ -101,62 +104,6 @@ fn seconds() -> u64 {
     text.parse().unwrap_or(10)
 }
 
-/// Links whose USB streams have one transfer in flight, to compare with.
-struct Single;
-
-struct SingleLink(Arc<dyn UsbLink>);
-
-impl Links for Single {
-    fn open(&self, target: &Target) -> Result<Arc<dyn Link>, LinkError> {
-        Cable.open(target)
-    }
-
-    fn open_usb(&self, target: &UsbTarget) -> Result<Arc<dyn UsbLink>, LinkError> {
-        Ok(Arc::new(SingleLink(Cable.open_usb(target)?)))
-    }
-}
-
-type Passed = Result<Option<usize>, LinkError>;
-
-impl UsbLink for SingleLink {
-    fn interfaces(&self) -> &[UsbInterface] {
-        self.0.interfaces()
-    }
-
-    fn claim(&self, interface: u8) -> Result<(), LinkError> {
-        self.0.claim(interface)
-    }
-
-    fn control_in(&self, request: Request, buffer: &mut [u8], deadline: Instant) -> Passed {
-        self.0.control_in(request, buffer, deadline)
-    }
-
-    fn control_out(&self, request: Request, bytes: &[u8], deadline: Instant) -> Passed {
-        self.0.control_out(request, bytes, deadline)
-    }
-
-    fn read(&self, endpoint: u8, buffer: &mut [u8], deadline: Instant) -> Passed {
-        self.0.read(endpoint, buffer, deadline)
-    }
-
-    fn write(&self, endpoint: u8, bytes: &[u8], deadline: Instant) -> Passed {
-        self.0.write(endpoint, bytes, deadline)
-    }
-
-    fn stream(
-        &self,
-        endpoint: u8,
-        _: usize,
-        bytes: usize,
-    ) -> Result<Box<dyn UsbStream + '_>, LinkError> {
-        Ok(Box::new(OneByOne::new(self, endpoint, bytes)))
-    }
-
-    fn clear_halt(&self, endpoint: u8) -> Result<(), LinkError> {
-        self.0.clear_halt(endpoint)
-    }
-}
-
 fn open(driver: &str, table: &str) -> Box<dyn Profiler> {
     open_over(&Cable, driver, table)
 }
@@ -232,59 +179,171 @@ fn tcp() {
     }
 }
 
+/// A device in a folder of its own, that programs see.
+fn carried(setup: u3v::Setup, run: impl FnOnce(&Socket<u3v::Profiler>, &Carrier<u3v::Profiler>)) {
+    let folder = std::env::temp_dir().join(format!("acies-bench-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let socket = Socket::new(u3v::Profiler::new(setup));
+    let carrier = Carrier::start(&folder, socket.clone()).expect("a carrier");
+    run(&socket, &carrier);
+    drop(carrier);
+    let _ = std::fs::remove_dir_all(folder);
+}
+
+/// This program again, with the device attached; what it said.
+fn child(carrier: &Carrier<u3v::Profiler>, order: &str) -> String {
+    let output = Command::new(std::env::current_exe().expect("this program"))
+        .envs(carrier.environment())
+        .env(CHILD, order)
+        .stderr(Stdio::inherit())
+        .output()
+        .expect("a child");
+    assert!(output.status.success(), "{order}");
+    String::from_utf8(output.stdout).expect("text")
+}
+
 fn usb() {
-    if library().is_none() {
-        say("USB over libusb: skipped, no libumockdev-preload.so.0 (Debian package umockdev)");
-        return;
-    }
     for (lines, format) in [
         (1, "Coord3D_C16"),
         (64, "Coord3D_C16"),
         (64, "Coord3D_ABC32f"),
     ] {
-        let folder = std::env::temp_dir().join(format!(
-            "acies-bench-{}-{lines}-{format}",
-            std::process::id()
-        ));
-        std::fs::create_dir_all(&folder).expect("a folder");
-        let device = u3v::Profiler::new(u3v::Setup {
+        let setup = u3v::Setup {
             lines,
             ..u3v::Setup::new("SN-1", u3v::Surface::Wave(COLUMNS))
+        };
+        carried(setup, |_, carrier| {
+            for way in ["overlapping", "single"] {
+                say(child(carrier, &format!("{lines} {format} {way}")).trim_end());
+            }
         });
-        let carrier = Carrier::start(&folder, Socket::new(device)).expect("a carrier");
-        for way in ["overlapping", "single"] {
-            let status = Command::new(std::env::current_exe().expect("this program"))
-                .envs(carrier.environment())
-                .env(CHILD, format!("{lines} {format} {way}"))
-                .status();
-            assert!(status.is_ok_and(|status| status.success()), "the child");
-        }
-        drop(carrier);
-        let _ = std::fs::remove_dir_all(folder);
     }
+}
+
+fn sustain_usb(lines: &str, format: &str, way: &str) {
+    let table = format!("features = [['PixelFormat', '{format}']]\nfirst_block = 0");
+    let host = Hesitant::new(&Cable, way == "single");
+    let mut profiler = open_over(&host, "u3v-profiler", &table);
+    let name = format!(
+        "u3v-profiler over simulated USB, {format}, {lines} lines a block, {way} transfers"
+    );
+    sustain(&name, profiler.as_mut());
+}
+
+// ---- A device that does not wait --------------------------------------------------------------------------------------
+
+/// Far below what the carrier takes on this machine when nobody hesitates: what is lost is lost by hesitating.
+const BLOCKS_HZ: f64 = 200.0;
+const BLOCK_LINES: u32 = 16;
+const ROOM_BLOCKS: usize = 2;
+/// From one hesitation to the next.
+const EVERY: Duration = Duration::from_millis(200);
+
+/// The host's reading thread is kept from its work again and again, and the device goes on: what is lost with one transfer at a time, what with
+/// several in flight, and whether the driver counts what the device lost.
+fn hesitating() {
+    say(&format!(
+        "u3v-profiler at {BLOCKS_HZ} blocks/s of {BLOCK_LINES} lines of {COLUMNS} points by its own clock, room for {ROOM_BLOCKS} blocks; every {EVERY:?} the host is busy elsewhere"
+    ));
+    for busy_ms in [0, 10, 25, 40] {
+        for way in ["single", "overlapping"] {
+            let setup = u3v::Setup {
+                rate_hz: Some(BLOCKS_HZ),
+                lines: BLOCK_LINES,
+                room_blocks: Some(ROOM_BLOCKS),
+                ..u3v::Setup::new("SN-1", u3v::Surface::Wave(COLUMNS))
+            };
+            carried(setup, |socket, carrier| {
+                let said = child(carrier, &format!("{busy_ms} busy {way}"));
+                let numbers: Vec<u64> = said
+                    .split_whitespace()
+                    .map(|word| word.parse().expect("a number"))
+                    .collect();
+                let [lines, lost, last_line] = numbers[..] else {
+                    panic!("three numbers: {said}");
+                };
+                let per_block = u64::from(BLOCK_LINES);
+                let (received, last) = (lines / per_block, last_line / per_block);
+                let truth = socket.with(|device| device.truth());
+                // What it lost behind the last one that came, nobody can know.
+                let overrun = truth.overrun.iter().filter(|block| **block < last).count() as u64;
+                say(&format!(
+                    "  busy for {busy_ms} ms, {way:<11}: {received:>6} blocks received, {overrun:>5} lost by the device ({:.2} %), {lost:>5} counted by the driver",
+                    100.0 * overrun as f64 / (received + overrun) as f64
+                ));
+                assert_eq!((lost, received + lost), (overrun, last + 1));
+            });
+        }
+    }
+}
+
+/// The child's part: the lines received, the blocks lost, and the last line.
+fn hesitate(busy: Duration, single: bool) {
+    let host = Hesitant::new(&Cable, single);
+    let mut profiler = open_over(&host, "u3v-profiler", "first_block = 0\nencoder_step = 10");
+    profiler.start().expect("a start");
+    let began = Instant::now();
+    let mut last = 0;
+    let mut next = EVERY;
+    while began.elapsed() < Duration::from_secs(seconds()) {
+        let profile = profiler.next(Instant::now() + Duration::from_secs(10));
+        last = profile
+            .expect("a link")
+            .expect("a profile in time")
+            .sequence;
+        if began.elapsed() > next && !busy.is_zero() {
+            let kept = host.busy();
+            std::thread::sleep(busy);
+            drop(kept);
+            next = began.elapsed() + EVERY;
+        }
+    }
+    let under_way = profiler.stop().expect("a stop");
+    last = under_way.last().map_or(last, |profile| profile.sequence);
+    let losses = profiler.losses();
+    say(&format!(
+        "{} {} {last}",
+        losses.received, losses.lost_on_link
+    ));
 }
 
 fn main() {
     if let Ok(child) = std::env::var(CHILD) {
-        let mut words = child.split(' ');
-        let (Some(lines), Some(format), Some(way)) = (words.next(), words.next(), words.next())
-        else {
-            panic!("lines, a format and a way: {child}");
-        };
-        let table = format!("features = [['PixelFormat', '{format}']]\nfirst_block = 0");
-        let links: &dyn Links = if way == "single" { &Single } else { &Cable };
-        let mut profiler = open_over(links, "u3v-profiler", &table);
-        let name = format!(
-            "u3v-profiler over simulated USB, {format}, {lines} lines a block, {way} transfers"
-        );
-        sustain(&name, profiler.as_mut());
+        match *child.split(' ').collect::<Vec<&str>>() {
+            [ms, "busy", way] => {
+                let busy = Duration::from_millis(ms.parse().expect("milliseconds"));
+                hesitate(busy, way == "single");
+            }
+            [lines, format, way] => sustain_usb(lines, format, way),
+            _ => panic!("what: {child}"),
+        }
         return;
     }
     // `cargo test` runs benches too, without this word.
     if !std::env::args().any(|argument| argument == "--bench") {
         return;
     }
-    decoding();
-    tcp();
-    usb();
+    let only = |name: &str| {
+        let words = std::env::args()
+            .skip(1)
+            .filter(|word| !word.starts_with('-'));
+        let words: Vec<String> = words.collect();
+        words.is_empty() || words.iter().any(|word| word == name)
+    };
+    if only("decoding") {
+        decoding();
+    }
+    if only("tcp") {
+        tcp();
+    }
+    if library().is_none() {
+        say("USB over libusb: skipped, no libumockdev-preload.so.0 (Debian package umockdev)");
+        return;
+    }
+    if only("usb") {
+        usb();
+    }
+    if only("hesitating") {
+        hesitating();
+    }
 }

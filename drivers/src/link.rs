@@ -58,6 +58,11 @@ pub trait Link: Send + Sync {
     /// [`LinkError::Gone`] when the other end closed or was unplugged.
     fn read(&self, buffer: &mut [u8], deadline: Instant) -> Result<usize, LinkError>;
 
+    /// When the bytes of the last read came, asked by who read them: now, but where a recording is played back, which knows it.
+    fn received(&self) -> Instant {
+        Instant::now()
+    }
+
     /// Writes all of `bytes`, or fails at `deadline`.
     ///
     /// # Errors

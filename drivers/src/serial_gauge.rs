@@ -553,7 +553,7 @@ impl Gauge {
             boot: 0,
             device_time_ns: 0,
             encoder: None,
-            host_time: Instant::now(),
+            host_time: self.link.received(),
             dropped: 0,
             saturated: false,
             x_mm: (0..n)

@@ -283,11 +283,10 @@ impl UsbItn {
         Profile {
             sequence: run.asked - 1,
             boot: 0,
-            // The tool has no clock: this is the host's, at the arrival of the reading.
             // It has no clock.
             device_time_ns: 0,
             encoder: None,
-            host_time: Instant::now(),
+            host_time: self.link.received(READINGS),
             dropped: 0,
             saturated: false,
             x_mm: vec![0.0],

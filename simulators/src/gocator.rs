@@ -322,6 +322,8 @@ const LOOK: Duration = Duration::from_millis(20);
 fn serve_control(stream: TcpStream, setup: &Setup, shared: &Shared) {
     let _ = stream.set_nodelay(true);
     let _ = stream.set_read_timeout(Some(LOOK));
+    // What the host of another connection had promised binds this one to nothing.
+    shared.update(|state| state.ping_deadline = None);
     let mut held = Vec::new();
     loop {
         match wire::receive(&stream, &mut held) {

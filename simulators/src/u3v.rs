@@ -2,13 +2,14 @@
 //! or zipped), Coord3D lines with an encoder and a time chunk.
 //!
 //! Where the standard leaves a choice, this device chooses: blocks count from 0 at every start; lines come as fast as the host takes them unless a rate is
-//! set; a device that was unplugged forgets all settings.
+//! set or they are triggered; a device that was unplugged forgets all settings. With a memory of so many blocks it does not wait for its host: what finds
+//! no room is lost, as in a real one.
 
 mod registers;
 
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -101,6 +102,11 @@ pub struct Setup {
     pub zipped: bool,
     /// Blocks a second; without it as fast as they are taken.
     pub rate_hz: Option<f64>,
+    /// Blocks are exposed at [`Profiler::trigger`], whatever the rate.
+    pub triggered: bool,
+    /// Room for so many blocks that the host has not taken; one that finds none is lost. Without a limit the device waits for the host. Only with a
+    /// rate or triggers.
+    pub room_blocks: Option<usize>,
     /// Blocks of a run: then the stage stands still.
     pub blocks: u64,
     /// What goes wrong.
@@ -120,6 +126,8 @@ impl Setup {
             big_chunks: false,
             zipped: false,
             rate_hz: None,
+            triggered: false,
+            room_blocks: None,
             blocks: u64::MAX,
             misdeeds: Misdeeds::default(),
         }
@@ -135,6 +143,8 @@ pub struct Truth {
     pub sent_count: u64,
     /// Blocks that it said it had discarded.
     pub discarded: u64,
+    /// Blocks that were lost because the host had not taken those before them, the first million.
+    pub overrun: Vec<u64>,
     /// The number of the next block.
     pub taken: u64,
     /// Commands that came.
@@ -149,10 +159,13 @@ pub struct Profiler {
     memory: Memory,
     acks: VecDeque<Vec<u8>>,
     stream: VecDeque<Vec<u8>>,
+    /// Transfers that are left of each block in `stream`.
+    held: VecDeque<usize>,
     rng: ChaCha8Rng,
     acquiring: bool,
     began: Instant,
     next: u64,
+    triggers: u64,
     waves: Vec<Vec<u8>>,
     truth: Truth,
 }
@@ -166,9 +179,11 @@ impl Profiler {
             setup,
             acks: VecDeque::new(),
             stream: VecDeque::new(),
+            held: VecDeque::new(),
             acquiring: false,
             began: Instant::now(),
             next: 0,
+            triggers: 0,
             waves: Vec::new(),
             truth: Truth::default(),
         }
@@ -187,6 +202,12 @@ impl Profiler {
         }
     }
 
+    /// One more block is exposed, whether the host has room or not.
+    pub fn trigger(&mut self) {
+        self.triggers += 1;
+        self.expose();
+    }
+
     /// Changes what goes wrong.
     pub fn misbehave(&mut self, misdeeds: Misdeeds) {
         self.setup.misdeeds = misdeeds;
@@ -196,7 +217,8 @@ impl Profiler {
         self.acquiring = true;
         self.began = Instant::now();
         self.next = 0;
-        self.stream.clear();
+        self.triggers = 0;
+        self.empty();
         self.rng = ChaCha8Rng::seed_from_u64(self.setup.seed);
         self.waves.clear();
         self.truth = Truth {
@@ -268,21 +290,76 @@ impl Profiler {
             self.acquiring = false;
         }
         if !self.memory.streaming() {
-            self.stream.clear();
+            self.empty();
         }
     }
 
     // ---- Stream -------------------------------------------------------------------------------------------------------
 
-    /// Queues the transfers of the next block, where there is one now.
-    fn shoot(&mut self) {
-        let due = self.setup.rate_hz.map_or(Duration::ZERO, |hz| {
-            Duration::from_secs_f64(self.next as f64 / hz)
-        });
-        let ready = self.acquiring && self.memory.streaming() && self.began.elapsed() >= due;
-        if !ready || self.next >= self.setup.blocks {
+    fn empty(&mut self) {
+        self.stream.clear();
+        self.held.clear();
+    }
+
+    /// Whether the next block is to be exposed by now.
+    fn is_due(&self) -> bool {
+        let due = match (self.setup.triggered, self.setup.rate_hz) {
+            (true, _) => self.next < self.triggers,
+            (false, Some(hz)) => self.began.elapsed().as_secs_f64() >= self.next as f64 / hz,
+            (false, None) => true,
+        };
+        due && self.acquiring && self.memory.streaming() && self.next < self.setup.blocks
+    }
+
+    /// Exposes what is due. Nothing leaves the device but by [`Model::input`], so that doing it then, for all the time before, is as good as at its time.
+    fn expose(&mut self) {
+        let Some(room) = self.setup.room_blocks else {
+            // It waits for the host. A gap queues nothing, so that a few blocks may have to be taken.
+            for _ in 0..64 {
+                if !self.stream.is_empty() || !self.is_due() {
+                    break;
+                }
+                self.shoot();
+            }
             return;
+        };
+        while self.is_due() {
+            if self.held.len() < room {
+                self.shoot();
+                continue;
+            }
+            if self.truth.overrun.len() < 1_000_000 {
+                self.truth.overrun.push(self.next);
+            }
+            self.next += 1;
         }
+    }
+
+    /// The next transfer, at most so many bytes of it.
+    fn hand_out(&mut self, most: usize) -> Option<Vec<u8>> {
+        let mut bytes = self.stream.pop_front()?;
+        if bytes.len() > most {
+            self.stream.push_front(bytes.split_off(most));
+        } else if let Some(left) = self.held.front_mut() {
+            *left -= 1;
+            if *left == 0 {
+                self.held.pop_front();
+            }
+        }
+        Some(bytes)
+    }
+
+    /// Queues the transfers of the next block.
+    fn shoot(&mut self) {
+        let before = self.stream.len();
+        self.queue_block();
+        let queued = self.stream.len() - before;
+        if queued > 0 {
+            self.held.push_back(queued);
+        }
+    }
+
+    fn queue_block(&mut self) {
         let id = self.next;
         self.next += 1;
         let misdeeds = self.setup.misdeeds.clone();
@@ -539,21 +616,8 @@ impl Model for Profiler {
                     stalls.stall_at = None;
                     return Outcome::Stall;
                 }
-                // A gap queues nothing, so that a few blocks may have to be taken.
-                for _ in 0..64 {
-                    if !self.stream.is_empty() {
-                        break;
-                    }
-                    self.shoot();
-                }
-                match self.stream.pop_front() {
-                    Some(mut bytes) if bytes.len() > most => {
-                        self.stream.push_front(bytes.split_off(most));
-                        Outcome::Data(bytes)
-                    }
-                    Some(bytes) => Outcome::Data(bytes),
-                    None => Outcome::Nak,
-                }
+                self.expose();
+                self.hand_out(most).map_or(Outcome::Nak, Outcome::Data)
             }
             _ => Outcome::Stall,
         }
@@ -561,7 +625,7 @@ impl Model for Profiler {
 
     fn powered(&mut self) {
         self.acquiring = false;
-        self.stream.clear();
+        self.empty();
         self.acks.clear();
         self.memory = Memory::new(&self.setup);
     }

@@ -461,14 +461,15 @@ impl<M: Model> Serving<M> {
         }
         while !self.requests.end.load(Ordering::Acquire) {
             self.plug_as_asked();
-            if self.wire.accept() {
-                self.model.attached(&mut self.out);
-            }
             let connected = self.receive() && self.send();
             if !connected && self.wire.has_host() {
                 self.wire.hang_up();
                 self.detach(false);
                 continue;
+            }
+            // After the last host was seen to be gone, where it is.
+            if self.wire.accept() {
+                self.model.attached(&mut self.out);
             }
             let timeout = match self.model.step(Instant::now(), &mut self.out) {
                 Next::Unplug if self.out.len() == 0 && self.wire.is_plugged() => {

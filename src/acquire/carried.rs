@@ -200,7 +200,7 @@ impl CarriedRun {
 
     /// What the profiler `view` saw, in the tool by the robot's clock, to find the lag with. `None` where a clock is none.
     pub fn pass(&self, view: usize, profiling: &Profiling, carrier: &Carrier) -> Option<Pass> {
-        let record = CarriedRecord {
+        CarriedRecord {
             // The others tell nothing of this one's clock.
             views: vec![CarriedView {
                 device: &profiling.name,
@@ -208,21 +208,8 @@ impl CarriedRun {
                 profiles: &self.took[view].profiles,
             }],
             ..self.record(&[], &carrier.plan)
-        };
-        let track = track_of(record.poses, record.machine_from_base);
-        let times = record.times().pop()??;
-        let tool_from_sensor = profiling.calibration.machine_from_sensor;
-        let profiles = self.took[view].profiles.iter().zip(times);
-        let seen = profiles.map(|(profile, time_s)| {
-            let columns = profile.x_mm.iter().zip(&profile.z_mm);
-            let seen = columns.filter(|(x, z)| x.is_finite() && z.is_finite());
-            let in_tool = seen.map(|(x, z)| tool_from_sensor.point(DVec3::new(*x, 0.0, *z)));
-            (time_s, in_tool.collect())
-        });
-        Some(Pass {
-            track,
-            profiles: seen.collect(),
-        })
+        }
+        .pass()
     }
 }
 
@@ -397,6 +384,24 @@ impl CarriedRecord<'_> {
             append(&mut cloud, placed.cloud, index as u16);
         }
         cloud
+    }
+
+    /// What its only profiler saw, in the tool by the robot's clock, to find the lag with. `None` where a clock is none, or of several profilers.
+    pub fn pass(&self) -> Option<Pass> {
+        let [view] = &self.views[..] else {
+            return None;
+        };
+        let times = self.times().pop()??;
+        let seen = view.profiles.iter().zip(times).map(|(profile, time_s)| {
+            let columns = profile.x_mm.iter().zip(&profile.z_mm);
+            let seen = columns.filter(|(x, z)| x.is_finite() && z.is_finite());
+            let in_tool = seen.map(|(x, z)| view.tool_from_sensor.point(DVec3::new(*x, 0.0, *z)));
+            (time_s, in_tool.collect())
+        });
+        Some(Pass {
+            track: track_of(self.poses, self.machine_from_base),
+            profiles: seen.collect(),
+        })
     }
 
     fn place(&self) -> (PoseTrack, Vec<PlacedView>) {

@@ -359,7 +359,7 @@ impl Record<'_> {
                 "{source}: no cell, expected --cell CELL.toml with the device"
             )));
         };
-        let device = find(cell, self.command.device.as_deref())?;
+        let (_, device) = find(cell, self.command.device.as_deref())?;
         let cloud = match recorded {
             true => self.replay(&device, source)?,
             false => self.live(&device, cell)?,

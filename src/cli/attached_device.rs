@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use acies_drivers::capture::Profile;
+use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot, Setup};
 use acies_drivers::link::Links;
 use anyhow::anyhow;
@@ -20,13 +20,13 @@ pub struct Configured<'a> {
     pub calibration: Option<Calibration>,
 }
 
-/// Reads the cell and finds the device called `name`, or the only one there is.
+/// Reads the cell.
 pub fn read_cell(path: &Path) -> Result<Cell, Failure> {
     Cell::read(path).map_err(|errors| Failure::BadInput(anyhow!("{errors}")))
 }
 
-/// The device called `name`; without a name the only one of the cell.
-pub fn find<'a>(cell: &'a Cell, name: Option<&str>) -> Result<Configured<'a>, Failure> {
+/// All devices of the cell, by name.
+pub fn all(cell: &Cell) -> Vec<(&str, Configured<'_>)> {
     let profilers = cell.profilers.iter().map(|p| {
         let configured = Configured {
             setup: &*p.setup,
@@ -48,8 +48,12 @@ pub fn find<'a>(cell: &'a Cell, name: Option<&str>) -> Result<Configured<'a>, Fa
         };
         (c.name.as_str(), configured)
     });
-    let all = profilers.chain(probes).chain(carriers);
-    let mut all: Vec<(&str, Configured<'a>)> = all.collect();
+    profilers.chain(probes).chain(carriers).collect()
+}
+
+/// The device called `name`; without a name the only one of the cell.
+pub fn find<'a>(cell: &'a Cell, name: Option<&str>) -> Result<(&'a str, Configured<'a>), Failure> {
+    let mut all = all(cell);
     let names: Vec<String> = all.iter().map(|(n, _)| format!("{n:?}")).collect();
     let place = match name {
         Some(name) => all.iter().position(|(n, _)| *n == name),
@@ -57,7 +61,7 @@ pub fn find<'a>(cell: &'a Cell, name: Option<&str>) -> Result<Configured<'a>, Fa
         None => None,
     };
     match place {
-        Some(place) => Ok(all.swap_remove(place).1),
+        Some(place) => Ok(all.swap_remove(place)),
         None => Err(Failure::Usage(anyhow!(
             "--device: {}, expected one of {}",
             name.map_or_else(|| "nothing".to_owned(), |name| format!("{name:?}")),
@@ -73,6 +77,9 @@ pub fn open(configured: &Configured<'_>, links: &dyn Links) -> Result<Instrument
         .open(links)
         .map_err(|error| Failure::Io(error.into()))
 }
+
+/// A driver that writes at other moments than it did when recorded is waited for no longer than this.
+pub const PATIENCE: Duration = Duration::from_millis(20);
 
 /// What a run of a profiler brought.
 pub struct Run {
@@ -175,8 +182,22 @@ pub fn summary(run: &Run) -> String {
     lines.join("\n")
 }
 
-/// Takes `count` poses, or as many as come in `limit`, and says what came.
-pub fn run_robot(robot: &mut dyn Robot, count: usize, limit: Duration) -> Result<String, Failure> {
+/// What a run of a robot brought.
+pub struct RobotRun {
+    /// In the order of receipt.
+    pub poses: Vec<Pose>,
+    /// What was lost.
+    pub losses: Losses,
+    /// Why it ended before it should, where it did.
+    pub ended: Option<String>,
+}
+
+/// Takes `count` poses, or as many as come in `limit`.
+pub fn run_robot(
+    robot: &mut dyn Robot,
+    count: usize,
+    limit: Duration,
+) -> Result<RobotRun, Failure> {
     let failed = |error: acies_drivers::error::DeviceError| Failure::Io(error.into());
     robot.start().map_err(failed)?;
     let until = Instant::now() + limit;
@@ -195,24 +216,33 @@ pub fn run_robot(robot: &mut dyn Robot, count: usize, limit: Duration) -> Result
         Ok(under_way) => poses.extend(under_way),
         Err(error) => ended = ended.or(Some(error.to_string())),
     }
+    Ok(RobotRun {
+        poses,
+        losses: robot.losses(),
+        ended,
+    })
+}
+
+/// A run of a robot in a few lines: counts, losses, where it stands.
+pub fn robot_summary(run: &RobotRun) -> String {
     let Losses {
         received,
         lost_on_link,
         rejected,
         ..
-    } = robot.losses();
+    } = run.losses;
     let mut lines = vec![format!(
         "{received} poses; missing by the robot's clock {lost_on_link}, rejected {rejected}"
     )];
-    if let [first, .., last] = &poses[..] {
+    if let [first, .., last] = &run.poses[..] {
         let seconds = last.device_time_s - first.device_time_s;
         let [x, y, z] = last.position_mm;
         lines.push(format!(
             "{seconds:.3} s by its clock; the tool is at {x:.3}, {y:.3}, {z:.3} mm"
         ));
     }
-    if let Some(ended) = ended {
+    if let Some(ended) = &run.ended {
         lines.push(format!("ended early: {ended}"));
     }
-    Ok(lines.join("\n"))
+    lines.join("\n")
 }

@@ -1,10 +1,11 @@
-//! `acies calibrate CELL.toml`: a profiler's pose and travel from recordings of a reference sphere, or the lag of a robot that carries it.
+//! `acies calibrate CELL.toml`: a profiler's pose and travel from recordings of a reference sphere, or the lag of a robot that carries it, live or
+//! from recordings.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
-use acies_drivers::device::{Identity, Instrument};
-use acies_drivers::error::DeviceError;
+use acies_drivers::device::{Identity, Instrument, Profiler, Robot};
+use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
 use acies_drivers::link::recording::Recording;
 use acies_drivers::link::replay::{Match, Replay};
@@ -12,12 +13,15 @@ use anyhow::anyhow;
 use glam::DVec3;
 use serde_json::json;
 
-use super::attached_device::{Configured, find, open, read_cell, run};
+use super::attached_device::{Configured, PATIENCE, find, open, read_cell, run, run_robot};
 use super::{Failure, Status, print_line};
 use crate::acquire::calibrate::{ProfilerCalibration, SphereScan, calibrate_profiler};
-use crate::acquire::lag::{Artefact, Lag, find_lag};
-use crate::acquire::{Carrier, Profiling, ScanEvent, run_carried};
-use crate::config::Cell;
+use crate::acquire::lag::{Artefact, Lag, Pass, find_lag};
+use crate::acquire::{CarriedRecord, CarriedView, Carrier, Profiling, ScanEvent, run_carried};
+use crate::config::{CarrierConfig, Cell, ProfilerConfig};
+
+/// Longest time that a recording is played.
+const HOUR: Duration = Duration::from_secs(3600);
 
 /// Finds where a profiler stands and how the stage runs, from recordings of a reference sphere at known places.
 ///
@@ -27,7 +31,7 @@ use crate::config::Cell;
 /// With `--lag` it finds the lag between a robot's poses and a profiler on it instead, with the devices of the cell: so many times the
 /// robot's program goes over a sphere of about `--radius`, or without it over a plate inclined to the path, and back; a pass is over where
 /// a scan is (`end_mm` of the robot), so that end and start are one place. Of several passes the scatter of the clocks is in the
-/// uncertainty too.
+/// uncertainty too. With `--lag-recording` it finds it in passes that were recorded by `acies record --all`, each in a folder of its own.
 #[derive(Debug, clap::Args)]
 pub struct Calibrate {
     /// The cell's configuration; its present calibration is the start.
@@ -36,14 +40,17 @@ pub struct Calibrate {
     #[arg(long, value_name = "NAME")]
     device: Option<String>,
     /// A recording of the sphere and the sphere's centre in the machine, mm: "sphere-0.aciesrec=120.5,30.1,42.0". Several times.
-    #[arg(long, value_name = "RECORDING=X,Y,Z", required_unless_present = "lag")]
+    #[arg(long, value_name = "RECORDING=X,Y,Z", required_unless_present_any = ["lag", "lag_recording"])]
     sphere: Vec<String>,
     /// Radius of the sphere, mm: certified for a pose, about right for a lag.
-    #[arg(long, value_name = "MM", required_unless_present = "lag")]
+    #[arg(long, value_name = "MM", required_unless_present_any = ["lag", "lag_recording"])]
     radius: Option<f64>,
     /// Find the lag of the cell's robot from so many passes to and fro.
     #[arg(long, value_name = "PASSES", conflicts_with = "sphere", value_parser = clap::value_parser!(u32).range(1..=100))]
     lag: Option<u32>,
+    /// Find it in a pass that was recorded: the folder with the recordings of robot and profiler. Several times.
+    #[arg(long, value_name = "FOLDER", conflicts_with_all = ["lag", "sphere"])]
+    lag_recording: Vec<PathBuf>,
     /// Standard uncertainty of each coordinate of a centre, mm.
     #[arg(long, value_name = "MM", default_value_t = 0.002)]
     u_centre: f64,
@@ -62,10 +69,10 @@ impl Calibrate {
     /// Bad input where configuration, recordings or places cannot be understood or do not hold the calibration.
     pub fn run(self) -> Result<Status, Failure> {
         let cell = read_cell(&self.cell)?;
-        if let Some(passes) = self.lag {
-            return self.find_lag(&cell, passes);
+        if self.lag.is_some() || !self.lag_recording.is_empty() {
+            return self.find_lag(&cell);
         }
-        let device = find(&cell, self.device.as_deref())?;
+        let (_, device) = find(&cell, self.device.as_deref())?;
         let rough = device
             .calibration
             .ok_or_else(|| Failure::Usage(anyhow!("--device: a probe, expected a profiler")))?;
@@ -101,8 +108,14 @@ impl Calibrate {
     }
 }
 
+/// The robot and the profiler on it whose lag is sought.
+struct LagDevices<'a> {
+    robot: &'a CarrierConfig,
+    profiler: &'a ProfilerConfig,
+}
+
 impl Calibrate {
-    fn find_lag(&self, cell: &Cell, passes: u32) -> Result<Status, Failure> {
+    fn find_lag(&self, cell: &Cell) -> Result<Status, Failure> {
         let artefact = match self.radius {
             None => Artefact::Plate,
             Some(radius_mm) if radius_mm.is_finite() && radius_mm > 0.0 => {
@@ -114,7 +127,27 @@ impl Calibrate {
                 )));
             }
         };
-        let config = cell.carrier.as_ref().ok_or_else(|| {
+        let devices = self.lag_devices(cell)?;
+        let taken = match self.lag {
+            Some(passes) => devices.run(passes)?,
+            None => {
+                let folders = self.lag_recording.iter();
+                folders
+                    .map(|folder| devices.replay(folder))
+                    .collect::<Result<_, _>>()?
+            }
+        };
+        let lag = find_lag(&taken, artefact).map_err(|error| Failure::BadInput(error.into()))?;
+        print_line(&if self.json {
+            lag_as_json(&lag, &devices.profiler.name).to_string()
+        } else {
+            lag_as_toml(&lag)
+        })?;
+        Ok(Status::Done)
+    }
+
+    fn lag_devices<'a>(&self, cell: &'a Cell) -> Result<LagDevices<'a>, Failure> {
+        let robot = cell.carrier.as_ref().ok_or_else(|| {
             Failure::BadInput(anyhow!(
                 "the cell has no robot: no device with [device.carrier]"
             ))
@@ -132,28 +165,44 @@ impl Calibrate {
                 names.join(", ")
             )));
         };
-        let io = |error: DeviceError| Failure::Io(error.into());
-        let Instrument::Robot(robot) = config.setup.open(&Cable).map_err(io)? else {
-            return Err(Failure::BadInput(anyhow!(
+        Ok(LagDevices { robot, profiler })
+    }
+}
+
+impl LagDevices<'_> {
+    fn open_robot(&self, links: &dyn Links) -> Result<Box<dyn Robot>, Failure> {
+        match self.robot.setup.open(links) {
+            Ok(Instrument::Robot(robot)) => Ok(robot),
+            Ok(_) => Err(Failure::BadInput(anyhow!(
                 "{}: expected a robot",
-                config.name
-            )));
-        };
-        let Instrument::Profiler(line) = profiler.setup.open(&Cable).map_err(io)? else {
-            return Err(Failure::BadInput(anyhow!(
+                self.robot.name
+            ))),
+            Err(error) => Err(Failure::Io(error.into())),
+        }
+    }
+
+    fn open_profiler(&self, links: &dyn Links) -> Result<Box<dyn Profiler>, Failure> {
+        match self.profiler.setup.open(links) {
+            Ok(Instrument::Profiler(profiler)) => Ok(profiler),
+            Ok(_) => Err(Failure::BadInput(anyhow!(
                 "{}: expected a profiler",
-                profiler.name
-            )));
-        };
+                self.profiler.name
+            ))),
+            Err(error) => Err(Failure::Io(error.into())),
+        }
+    }
+
+    /// Passes with the devices themselves.
+    fn run(&self, passes: u32) -> Result<Vec<Pass>, Failure> {
         let mut carrier = Carrier {
-            name: config.name.clone(),
-            robot,
-            plan: config.plan,
+            name: self.robot.name.clone(),
+            robot: self.open_robot(&Cable)?,
+            plan: self.robot.plan,
         };
         let mut profilers = [Profiling {
-            name: profiler.name.clone(),
-            profiler: line,
-            calibration: profiler.calibration,
+            name: self.profiler.name.clone(),
+            profiler: self.open_profiler(&Cable)?,
+            calibration: self.profiler.calibration,
         }];
         let mut taken = Vec::new();
         for number in 1..=passes {
@@ -164,19 +213,75 @@ impl Calibrate {
                 return Err(Failure::Io(anyhow!("pass {number}: {why}")));
             }
             let pass = run.pass(0, &profilers[0], &carrier);
-            taken.push(pass.ok_or_else(|| {
-                Failure::BadInput(anyhow!(
-                    "pass {number}: a device's times are no clock; check that its clock is on"
-                ))
-            })?);
+            taken.push(pass.ok_or_else(|| no_clock(&format!("pass {number}")))?);
         }
-        let lag = find_lag(&taken, artefact).map_err(|error| Failure::BadInput(error.into()))?;
-        print_line(&if self.json {
-            lag_as_json(&lag, &profiler.name).to_string()
-        } else {
-            lag_as_toml(&lag)
-        })?;
-        Ok(Status::Done)
+        Ok(taken)
+    }
+
+    /// A pass of which both recordings are in `folder`, through the same drivers.
+    fn replay(&self, folder: &Path) -> Result<Pass, Failure> {
+        let arm = recording_of(folder, &self.robot.name)?;
+        let line = recording_of(folder, &self.profiler.name)?;
+        let run_of = |recording: &Recording| recording.note("run ");
+        if run_of(&arm).is_none() || run_of(&arm) != run_of(&line) {
+            return Err(Failure::BadInput(anyhow!(
+                "{}: {} and {} were not recorded at once, so that their times are by different clocks; record both with `acies record --all`",
+                folder.display(),
+                self.robot.name,
+                self.profiler.name
+            )));
+        }
+        let began = Instant::now();
+        let played = |recording| Replay::of_run(recording, Match::Loose(PATIENCE), began);
+        let mut robot = self.open_robot(&played(arm))?;
+        let poses = run_robot(robot.as_mut(), usize::MAX, HOUR)?.poses;
+        let mut profiler = self.open_profiler(&played(line))?;
+        let silence = Duration::from_secs(1);
+        let profiles = run(profiler.as_mut(), usize::MAX, HOUR, silence)?.profiles;
+        CarriedRecord {
+            views: vec![CarriedView {
+                device: &self.profiler.name,
+                tool_from_sensor: self.profiler.calibration.machine_from_sensor,
+                profiles: &profiles,
+            }],
+            poses: &poses,
+            machine_from_base: self.robot.plan.machine_from_base,
+            lag_s: 0.0,
+        }
+        .pass()
+        .ok_or_else(|| no_clock(&folder.display().to_string()))
+    }
+}
+
+fn no_clock(pass: &str) -> Failure {
+    Failure::BadInput(anyhow!(
+        "{pass}: a device's times are no clock; check that its clock is on"
+    ))
+}
+
+/// The one recording of a device in a folder, by what is noted in it.
+fn recording_of(folder: &Path, device: &str) -> Result<Recording, Failure> {
+    let failed = |error: std::io::Error| {
+        let context = format!("{}: cannot be read", folder.display());
+        Failure::BadInput(anyhow::Error::from(error).context(context))
+    };
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(failed)? {
+        let path = entry.map_err(failed)?.path();
+        if path.extension().is_none_or(|of| of != "aciesrec") {
+            continue;
+        }
+        let recording = Recording::read(&path).map_err(|error| Failure::BadInput(error.into()))?;
+        if recording.note("device ").as_deref() == Some(device) {
+            found.push(recording);
+        }
+    }
+    match found.len() {
+        1 => Ok(found.remove(0)),
+        n => Err(Failure::BadInput(anyhow!(
+            "{}: {n} recordings of {device}, expected one",
+            folder.display()
+        ))),
     }
 }
 
@@ -234,14 +339,13 @@ fn replay(
     path: &Path,
 ) -> Result<(Identity, Vec<acies_drivers::capture::Profile>), Failure> {
     let recording = Recording::read(path).map_err(|error| Failure::BadInput(error.into()))?;
-    let links = Replay::new(recording, Match::Loose(Duration::from_millis(20)));
+    let links = Replay::new(recording, Match::Loose(PATIENCE));
     let Instrument::Profiler(mut profiler) = open(device, &links)? else {
         return Err(Failure::Usage(anyhow!(
             "--device: a probe, expected a profiler"
         )));
     };
-    let hour = Duration::from_secs(3600);
-    let run = run(profiler.as_mut(), usize::MAX, hour, Duration::from_secs(1))?;
+    let run = run(profiler.as_mut(), usize::MAX, HOUR, Duration::from_secs(1))?;
     Ok((profiler.identity().clone(), run.profiles))
 }
 

@@ -7,7 +7,9 @@ use acies_drivers::device::Instrument;
 use acies_drivers::link::cable::Cable;
 use anyhow::anyhow;
 
-use super::attached_device::{find, named, open, read_cell, run, run_robot, summary};
+use super::attached_device::{
+    find, named, open, read_cell, robot_summary, run, run_robot, summary,
+};
 use super::{Failure, Status, print_line};
 
 /// Opens one device of a cell, says who it is, and tries it: a profiler measures a few profiles, a probe touches once.
@@ -41,7 +43,7 @@ impl Probe {
     /// Bad input where the configuration has mistakes; input or output where the device does not open or fails.
     pub fn run(self) -> Result<Status, Failure> {
         let cell = read_cell(&self.cell)?;
-        let device = find(&cell, self.device.as_deref())?;
+        let (_, device) = find(&cell, self.device.as_deref())?;
         let limit = Duration::from_secs_f64(self.seconds);
         match open(&device, &Cable)? {
             Instrument::Profiler(mut profiler) => {
@@ -58,7 +60,8 @@ impl Probe {
             }
             Instrument::Robot(mut robot) => {
                 print_line(&named(robot.identity()))?;
-                print_line(&run_robot(robot.as_mut(), self.profiles, limit)?)?;
+                let run = run_robot(robot.as_mut(), self.profiles, limit)?;
+                print_line(&robot_summary(&run))?;
             }
             Instrument::Probe(mut probe) => {
                 print_line(&named(probe.identity()))?;

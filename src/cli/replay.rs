@@ -7,7 +7,9 @@ use acies_drivers::device::Instrument;
 use acies_drivers::link::recording::Recording;
 use acies_drivers::link::replay::{Match, Replay};
 
-use super::attached_device::{find, named, open, read_cell, run, run_robot, summary};
+use super::attached_device::{
+    PATIENCE, find, named, open, read_cell, robot_summary, run, run_robot, summary,
+};
 use super::{Failure, Status, print_line};
 use crate::acquire::Assembler;
 use crate::points::write_scan;
@@ -27,9 +29,6 @@ pub struct ReplayCommand {
     output: Option<PathBuf>,
 }
 
-/// A driver that writes at other moments than it did when recorded is waited for no longer than this.
-const PATIENCE: Duration = Duration::from_millis(20);
-
 impl ReplayCommand {
     /// Carries the command out.
     ///
@@ -37,7 +36,7 @@ impl ReplayCommand {
     /// Bad input where configuration or recording cannot be understood; input or output where a file cannot be written.
     pub fn run(self) -> Result<Status, Failure> {
         let cell = read_cell(&self.cell)?;
-        let device = find(&cell, self.device.as_deref())?;
+        let (_, device) = find(&cell, self.device.as_deref())?;
         let recording =
             Recording::read(&self.recording).map_err(|error| Failure::BadInput(error.into()))?;
         for note in recording.notes() {
@@ -63,7 +62,8 @@ impl ReplayCommand {
             Instrument::Robot(mut robot) => {
                 print_line(&named(robot.identity()))?;
                 let hour = Duration::from_secs(3600);
-                print_line(&run_robot(robot.as_mut(), usize::MAX, hour)?)?;
+                let run = run_robot(robot.as_mut(), usize::MAX, hour)?;
+                print_line(&robot_summary(&run))?;
             }
             Instrument::Probe(probe) => print_line(&named(probe.identity()))?,
         }

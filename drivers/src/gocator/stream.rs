@@ -328,7 +328,7 @@ pub(super) fn take_data(link: &Arc<dyn Link>, shared: &Shared, reading: &Reading
             Ok(n) => n,
             Err(error) => return shared.end(Over::Link(Some(error))),
         };
-        let now = Instant::now();
+        let (now, came) = (Instant::now(), link.received());
         // Points are computed without the lock, so that the caller may take others meanwhile.
         let taken = decoder.take(&chunk[..n], |bytes| {
             if group.take(bytes, reading) {
@@ -338,7 +338,7 @@ pub(super) fn take_data(link: &Arc<dyn Link>, shared: &Shared, reading: &Reading
         let mut inbox = shared.lock();
         inbox.heard = now;
         for mut group in ready.drain(..) {
-            group.close(&mut inbox, now);
+            group.close(&mut inbox, came);
         }
         let overgrown = group.bytes > GROUP_BYTES;
         drop(inbox);

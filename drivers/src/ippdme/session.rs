@@ -341,7 +341,7 @@ impl Session {
                         }));
                     }
                     pending.data.push(items);
-                    pending.arrived.push(Instant::now());
+                    pending.arrived.push(self.link.received());
                 }
                 Kind::Error(report) => {
                     // An error may stand in place of the acknowledgement, and the end still follows.

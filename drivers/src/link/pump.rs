@@ -192,15 +192,14 @@ fn run(link: &Arc<dyn Link>, shared: &Shared) {
         } else {
             drop(inbox);
             let read = link.read(&mut buffer, Instant::now() + SLICE);
+            let came = link.received();
             let mut inbox = shared.lock();
             match read {
                 Ok(0) => {}
                 Ok(n) => {
                     inbox.bytes += n;
                     inbox.heard_bytes += n as u64;
-                    inbox
-                        .chunks
-                        .push_back((Instant::now(), buffer[..n].to_vec()));
+                    inbox.chunks.push_back((came, buffer[..n].to_vec()));
                     shared.arrived.notify_all();
                 }
                 Err(error) => {

@@ -11,7 +11,7 @@
 //! | 1 | 1 | channel; 0 in version 1 |
 //! | 2 | 2 | 0 |
 //! | 4 | 4 | length of the bytes, u32, at most 1 MiB |
-//! | 8 | 8 | time, u64, ns since the link was opened, never decreasing |
+//! | 8 | 8 | time, u64, ns since the link was opened, or since a moment that several files share; never decreasing |
 //! | 16 | length | the bytes |
 //! | 16 + length | 4 | CRC-32C of the record up to here |
 //!
@@ -140,7 +140,7 @@ pub struct Record {
     pub kind: Kind,
     /// Which of the links it passed over, from 0 in the order of their opening.
     pub channel: u8,
-    /// Time since the link was opened.
+    /// Time since the link was opened, or since the moment that [`Recorder::counting_from`] was told.
     pub time: Duration,
     /// The bytes that passed.
     pub bytes: Vec<u8>,
@@ -210,6 +210,13 @@ impl Recording {
             encode_record(&mut bytes, place, record.time, &record.bytes);
         }
         bytes
+    }
+
+    /// The note that begins with this word, without it.
+    pub fn note(&self, word: &str) -> Option<String> {
+        let notes = self.notes();
+        let found = notes.iter().find_map(|note| note.strip_prefix(word));
+        found.map(|rest| rest.trim_start().to_owned())
     }
 
     /// Where it comes from, as was written down.
@@ -312,6 +319,8 @@ pub struct Recorder<L> {
     folder: PathBuf,
     limit_bytes: u64,
     opened: AtomicU32,
+    /// What times are counted from; otherwise from the opening of each file's first link.
+    began: Option<Instant>,
     /// The one file of all links, where there is only one.
     whole: Option<Mutex<Whole>>,
 }
@@ -331,7 +340,16 @@ impl<L> Recorder<L> {
             folder: folder.into(),
             limit_bytes,
             opened: AtomicU32::new(0),
+            began: None,
             whole: None,
+        }
+    }
+
+    /// Counts all times from this moment: recorders of several devices that run together then write by one clock.
+    pub fn counting_from(self, began: Instant) -> Recorder<L> {
+        Recorder {
+            began: Some(began),
+            ..self
         }
     }
 
@@ -387,7 +405,7 @@ impl<L> Recorder<L> {
                 source,
             })?;
         Ok(Arc::new(Tape {
-            opened: Instant::now(),
+            opened: self.began.unwrap_or_else(Instant::now),
             writer: Mutex::new(Writer {
                 path,
                 file: Some(file),
@@ -534,6 +552,10 @@ impl Link for Recorded {
         answer
     }
 
+    fn received(&self) -> Instant {
+        self.link.received()
+    }
+
     fn write(&self, bytes: &[u8], deadline: Instant) -> Result<(), LinkError> {
         // Written down before it is sent: the device may answer before this thread goes on.
         self.tape.put(Kind::ToDevice, self.channel, bytes);
@@ -622,6 +644,10 @@ impl UsbLink for RecordedUsb {
         answer
     }
 
+    fn received(&self, endpoint: u8) -> Instant {
+        self.link.received(endpoint)
+    }
+
     fn write(
         &self,
         endpoint: u8,
@@ -670,5 +696,9 @@ impl UsbStream for RecordedStream<'_> {
             Err(error) => self.usb.note_failure(self.channel, error),
         }
         answer
+    }
+
+    fn received(&self) -> Instant {
+        self.stream.received()
     }
 }

@@ -18,7 +18,7 @@ pub enum Match {
     /// Every write must be the recorded one, byte for byte. For drivers that ask and wait.
     Exact,
     /// Any write passes. A recorded write that the driver does not repeat within this time is passed over: keep-alives come
-    /// at other moments than they were recorded.
+    /// at other moments than they were recorded, and fewer of them, because a recording is played back faster.
     Loose(Duration),
 }
 
@@ -26,7 +26,13 @@ pub enum Match {
 /// Longer than any keep-alive's interval of ours, so that a start is never passed over while the caller still makes ready.
 const OTHERS_WRITE: Duration = Duration::from_secs(3);
 
-/// Opens the links of a recording, each once. A link is found by its target's name, or else the next in the order of opening is taken: a
+/// Recorded times are counted from so much ahead of now: nothing that is played back seems to be late, however slowly it goes.
+const AHEAD: Duration = Duration::from_secs(3600);
+
+/// Opens the links of a recording, each once. What came has the time at which it came then ([`Link::received`]), to the nanosecond, though it is
+/// played back as fast as it is taken.
+///
+/// A link is found by its target's name, or else the next in the order of opening is taken: a
 /// device may have another address than it had.
 pub struct Replay {
     shared: Arc<Shared>,
@@ -34,6 +40,8 @@ pub struct Replay {
 
 struct Shared {
     matching: Match,
+    /// The moment that the recording's times are counted from.
+    began: Instant,
     written: Condvar,
     tape: Mutex<Tape>,
 }
@@ -43,12 +51,33 @@ struct Tape {
     records: Vec<Record>,
     /// For each record, how many recorded writes lie before it.
     writes_before: Vec<usize>,
-    /// Indices of the recorded writes.
-    writes: Vec<usize>,
+    /// The recorded writes.
+    writes: Vec<Write>,
     openings: Vec<Opening>,
     channels: BTreeMap<u8, Cursor>,
     /// Writes of the driver, and recorded ones that were passed over.
     credit: usize,
+}
+
+/// A recorded write.
+struct Write {
+    /// Its index among the records.
+    record: usize,
+    /// The write before it on its channel.
+    before: Option<usize>,
+    /// The one before or behind it on its channel is the same.
+    repeated: bool,
+    /// The next that passed on its channel came from the device.
+    answered: bool,
+    passed_over: bool,
+}
+
+impl Write {
+    /// Data on other channels need not wait for it: it is said again and again, and what it asks for comes on its own channel. A question that is
+    /// answered elsewhere is none.
+    fn is_keep_alive(&self) -> bool {
+        self.repeated && self.answered
+    }
 }
 
 /// A link that was opened when the recording was made.
@@ -64,14 +93,22 @@ struct Opening {
 struct Cursor {
     records: VecDeque<usize>,
     byte: usize,
+    /// Time of the last record that was given out.
+    came: Duration,
 }
 
 impl Replay {
     /// Plays `recording` to those who open its links; for everyone after that it is [`LinkError::Busy`].
     pub fn new(recording: Recording, matching: Match) -> Replay {
+        Replay::of_run(recording, matching, Instant::now())
+    }
+
+    /// As [`Replay::new`], for one of several devices of a run: with the same `began` for all, their times are by one clock as they were.
+    pub fn of_run(recording: Recording, matching: Match, began: Instant) -> Replay {
         Replay {
             shared: Arc::new(Shared {
                 matching,
+                began: began + AHEAD,
                 written: Condvar::new(),
                 tape: Mutex::new(Tape::new(recording)),
             }),
@@ -110,10 +147,27 @@ impl Tape {
             channels: BTreeMap::new(),
             credit: 0,
         };
+        // The last write of each channel.
+        let mut last: BTreeMap<u8, usize> = BTreeMap::new();
         for (i, record) in tape.records.iter().enumerate() {
             tape.writes_before.push(tape.writes.len());
             match record.kind {
-                Kind::ToDevice => tape.writes.push(i),
+                Kind::ToDevice => {
+                    let before = last.insert(record.channel, tape.writes.len());
+                    let repeated = before.is_some_and(|before| {
+                        let before = &mut tape.writes[before];
+                        let same = tape.records[before.record].bytes == record.bytes;
+                        before.repeated |= same;
+                        same
+                    });
+                    tape.writes.push(Write {
+                        record: i,
+                        before,
+                        repeated,
+                        answered: false,
+                        passed_over: false,
+                    });
+                }
                 Kind::Opened => tape.openings.push(Opening {
                     channel: record.channel,
                     name: String::from_utf8_lossy(&record.bytes).into_owned(),
@@ -127,6 +181,9 @@ impl Tape {
                 }
                 Kind::Note => {}
                 Kind::FromDevice | Kind::Gone | Kind::Limit | Kind::Failed => {
+                    if let Some(write) = last.get(&record.channel) {
+                        tape.writes[*write].answered = true;
+                    }
                     let cursor = tape.channels.entry(record.channel).or_default();
                     cursor.records.push_back(i);
                 }
@@ -154,6 +211,51 @@ impl Tape {
             opening.channel,
             opening.interfaces.clone().unwrap_or_default(),
         ))
+    }
+
+    /// The keep-alive that is next was not written by the driver. Of the answers to such ones only the last is kept, should one be asked for after all.
+    fn pass_over(&mut self) {
+        let write = &mut self.writes[self.credit];
+        write.passed_over = true;
+        let (record, before) = (write.record, write.before);
+        self.credit += 1;
+        let Some(before) = before.map(|before| &self.writes[before]) else {
+            return;
+        };
+        if let Some(cursor) = self.channels.get_mut(&self.records[record].channel)
+            && before.passed_over
+        {
+            // In order of the records, and near the front.
+            let place = |of: usize| cursor.records.partition_point(|i| *i < of);
+            let answers = place(before.record)..place(record);
+            cursor.records.drain(answers);
+        }
+    }
+
+    /// The driver wrote: the recorded write that this is, with the keep-alives before it that did not come.
+    fn written(&mut self, channel: u8, bytes: &[u8]) {
+        let is_this = |write: &Write| {
+            let record = &self.records[write.record];
+            record.channel == channel && record.bytes == bytes
+        };
+        let ahead = self.writes.get(self.credit..).unwrap_or_default();
+        let this = ahead
+            .iter()
+            .position(|write| is_this(write) || !write.is_keep_alive());
+        match this.map(|place| self.credit + place) {
+            Some(place) if is_this(&self.writes[place]) => {
+                while self.credit < place {
+                    self.pass_over();
+                }
+                self.credit += 1;
+            }
+            // One more keep-alive than there were: no other command is taken for it.
+            _ if self
+                .writes
+                .iter()
+                .any(|write| write.is_keep_alive() && is_this(write)) => {}
+            _ => self.credit += 1,
+        }
     }
 
     /// Nothing is left that any channel could give.
@@ -197,20 +299,22 @@ impl Shared {
                     };
                 }
                 Some(i) => {
-                    let awaited = tape.writes[tape.credit];
-                    let own = tape.records[awaited].channel == channel;
+                    let awaited = &tape.writes[tape.credit];
+                    let own = tape.records[awaited.record].channel == channel;
+                    let kept_alive = awaited.is_keep_alive();
                     let patience = match self.matching {
                         Match::Exact => None,
-                        Match::Loose(patience) if own => Some(patience),
+                        Match::Loose(patience) if own || kept_alive => Some(patience),
                         Match::Loose(patience) => Some(patience.max(OTHERS_WRITE)),
                     };
                     let until = patience.map(|patience| began + patience);
                     if until.is_some_and(|until| Instant::now() >= until) {
                         // Up to here, or to the next one of another channel.
-                        tape.credit = match own {
-                            true => tape.credit + 1,
-                            false => tape.writes_before[i],
-                        };
+                        match (own, kept_alive) {
+                            (false, true) => tape.pass_over(),
+                            (true, _) => tape.credit += 1,
+                            (false, false) => tape.credit = tape.writes_before[i],
+                        }
                         self.written.notify_all();
                         continue;
                     }
@@ -230,14 +334,20 @@ impl Shared {
         }
     }
 
+    fn received(&self, channel: u8) -> Instant {
+        let tape = self.lock();
+        let came = tape.channels.get(&channel).map(|cursor| cursor.came);
+        self.began + came.unwrap_or_default()
+    }
+
     fn write(&self, channel: u8, bytes: &[u8]) -> Result<(), LinkError> {
         let mut tape = self.lock();
         if self.matching == Match::Exact {
-            let at = tape.writes.get(tape.credit).ok_or(LinkError::Gone)?;
-            let record = &tape.records[*at];
+            let at = tape.writes.get(tape.credit).ok_or(LinkError::Gone)?.record;
+            let record = &tape.records[at];
             // What was recorded before it has been read.
             let cursor = tape.channels.get(&record.channel);
-            let read = cursor.is_none_or(|c| c.records.front().is_none_or(|first| first > at));
+            let read = cursor.is_none_or(|c| c.records.front().is_none_or(|first| *first > at));
             if !read || record.bytes != bytes || record.channel != channel {
                 return Err(LinkError::Departed {
                     found: hex(bytes),
@@ -246,7 +356,10 @@ impl Shared {
                 });
             }
         }
-        tape.credit += 1;
+        match self.matching {
+            Match::Exact => tape.credit += 1,
+            Match::Loose(_) => tape.written(channel, bytes),
+        }
         self.written.notify_all();
         Ok(())
     }
@@ -275,6 +388,7 @@ impl Link for Played {
             let n = rest.len().min(buffer.len());
             buffer[..n].copy_from_slice(&rest[..n]);
             cursor.byte += n;
+            cursor.came = records[i].time;
             if n == rest.len() {
                 cursor.records.pop_front();
                 cursor.byte = 0;
@@ -284,6 +398,10 @@ impl Link for Played {
             }
             tape = held;
         }
+    }
+
+    fn received(&self) -> Instant {
+        self.shared.received(self.channel)
     }
 
     fn write(&self, bytes: &[u8], _: Instant) -> Result<(), LinkError> {
@@ -313,11 +431,10 @@ impl PlayedUsb {
             Next::Nothing => return Ok(None),
             Next::Over => return Err(LinkError::Gone),
         };
-        tape.channels
-            .entry(channel)
-            .or_default()
-            .records
-            .pop_front();
+        let came = tape.records[i].time;
+        let cursor = tape.channels.entry(channel).or_default();
+        cursor.records.pop_front();
+        cursor.came = came;
         let record = &tape.records[i];
         match (record.kind, &record.bytes[..]) {
             (Kind::Failed, [2]) => Err(LinkError::Overflow),
@@ -395,6 +512,10 @@ impl UsbLink for PlayedUsb {
         deadline: Instant,
     ) -> Result<Option<usize>, LinkError> {
         self.transfer(self.channel_of(endpoint), buffer, deadline)
+    }
+
+    fn received(&self, endpoint: u8) -> Instant {
+        self.shared.received(self.channel_of(endpoint))
     }
 
     fn write(&self, endpoint: u8, bytes: &[u8], _: Instant) -> Result<Option<usize>, LinkError> {

@@ -199,6 +199,11 @@ pub trait UsbLink: Send + Sync {
         buffer: &mut [u8],
         deadline: Instant,
     ) -> Result<Option<usize>, LinkError>;
+    /// When the last transfer from an endpoint came, asked by who read it: now, but where a recording is played back, which knows it.
+    fn received(&self, endpoint: u8) -> Instant {
+        let _ = endpoint;
+        Instant::now()
+    }
     /// One transfer to a bulk endpoint.
     ///
     /// # Errors
@@ -233,6 +238,10 @@ pub trait UsbStream {
     /// # Errors
     /// As [`UsbLink::read`]; after an error nothing is in flight until the next call.
     fn next(&mut self, deadline: Instant) -> Result<Option<&[u8]>, LinkError>;
+    /// When the last transfer came, as of [`UsbLink::received`].
+    fn received(&self) -> Instant {
+        Instant::now()
+    }
 }
 
 /// A stream of a link that has one transfer in flight at a time.
@@ -257,6 +266,10 @@ impl UsbStream for OneByOne<'_> {
     fn next(&mut self, deadline: Instant) -> Result<Option<&[u8]>, LinkError> {
         let n = self.link.read(self.endpoint, &mut self.buffer, deadline)?;
         Ok(n.map(|n| &self.buffer[..n]))
+    }
+
+    fn received(&self) -> Instant {
+        self.link.received(self.endpoint)
     }
 }
 

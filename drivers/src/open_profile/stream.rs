@@ -352,19 +352,19 @@ struct Line<'a> {
 impl Line<'_> {
     fn read(&mut self, shared: &Shared) {
         let read = self.link.read(&mut self.chunk, Instant::now() + SLICE);
-        let now = Instant::now();
+        let (now, came) = (Instant::now(), self.link.received());
         let mut inbox = shared.lock();
         let inbox = &mut *inbox;
         match read {
             Ok(0) => {
                 if now.saturating_duration_since(inbox.heard) >= STALL {
-                    self.decoder.stalled(|frame| inbox.accept(frame, now));
+                    self.decoder.stalled(|frame| inbox.accept(frame, came));
                 }
             }
             Ok(n) => {
                 inbox.heard_something(n);
                 self.decoder
-                    .take(&self.chunk[..n], |frame| inbox.accept(frame, now));
+                    .take(&self.chunk[..n], |frame| inbox.accept(frame, came));
             }
             Err(error) => inbox.over = Some(Over::Link(Some(error))),
         }

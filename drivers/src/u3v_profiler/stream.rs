@@ -430,14 +430,13 @@ fn read_blocks(link: &dyn UsbLink, shared: &Shared, reading: &Reading) -> Result
             }
             Err(error) => return Err(gone(error)),
         };
-        let now = Instant::now();
         match blocks.take(bytes) {
             Step::Nothing => {}
             Step::Spoilt(id) => spoil(shared, id, false),
             Step::Block(leader, trailer) => {
                 stalls = 0;
                 let whole = (&leader, &trailer, &blocks.payload[..]);
-                block(shared, reading, whole, &mut wraps, now)?;
+                block(shared, reading, whole, &mut wraps, reads.received())?;
             }
         }
     }
@@ -449,17 +448,17 @@ fn block(
     reading: &Reading,
     (leader, trailer, payload): (&Leader, &Trailer, &[u8]),
     wraps: &mut Wraps,
-    now: Instant,
+    came: Instant,
 ) -> Result<(), Over> {
     let id = leader.block_id;
     if trailer.status != 0 {
         spoil(shared, Some(id), DISCARDED.contains(&trailer.status));
         return Ok(());
     }
-    match profiles(leader, trailer, payload, reading, wraps, now) {
+    match profiles(leader, trailer, payload, reading, wraps, came) {
         Ok(profiles) => {
             let mut inbox = shared.lock();
-            inbox.heard = now;
+            inbox.heard = Instant::now();
             inbox.accept(id, profiles);
             drop(inbox);
             shared.arrived.notify_all();

@@ -401,6 +401,68 @@ fn a_loose_replay_passes_over_writes_that_do_not_come() {
     ));
 }
 
+/// Data on the one channel, pings on the other: the data do not wait for pings, no ping takes the answer of the stop, and one that is asked late, or
+/// once more than it was, is answered too. What came keeps its time.
+#[test]
+fn data_do_not_wait_for_the_keep_alives_of_another_channel() {
+    const PINGS: u64 = 200;
+    let record = |kind, channel, ms: u64, bytes: &[u8]| Record {
+        kind,
+        channel,
+        time: Duration::from_millis(ms),
+        bytes: bytes.into(),
+    };
+    let mut records = vec![
+        record(Kind::Opened, 0, 0, b"/dev/control"),
+        record(Kind::Opened, 1, 0, b"/dev/data"),
+        record(Kind::ToDevice, 0, 1, b"start"),
+        record(Kind::FromDevice, 0, 2, b"started"),
+    ];
+    for ping in 1..=PINGS {
+        let ms = 1000 * ping;
+        records.push(record(Kind::FromDevice, 1, ms, b"data"));
+        records.push(record(Kind::ToDevice, 0, ms + 1, b"ping"));
+        records.push(record(Kind::FromDevice, 0, ms + 2, b"pong"));
+    }
+    records.push(record(Kind::ToDevice, 0, 300_000, b"stop"));
+    records.push(record(Kind::FromDevice, 0, 300_001, b"stopped"));
+    let recording = Recording {
+        target: "t".into(),
+        records,
+        torn_at: None,
+    };
+    let began = Instant::now();
+    let replay = Replay::of_run(recording, Match::Loose(Duration::from_micros(100)), began);
+    let control = replay.open(&port("/dev/control")).expect("a replay");
+    let data = replay.open(&port("/dev/data")).expect("a replay");
+    control.write(b"start", soon()).expect("a write");
+    assert_eq!(read_exact(&*control, 7), b"started");
+    let mut came = Vec::new();
+    for _ in 0..PINGS - 10 {
+        assert_eq!(read_exact(&*data, 4), b"data");
+        came.push(data.received());
+    }
+    let steps = came.windows(2).map(|pair| pair[1] - pair[0]);
+    assert!(steps.into_iter().all(|step| step == Duration::from_secs(1)));
+    // The answer to one that was passed over, and one that is in its turn.
+    for _ in 0..2 {
+        control.write(b"ping", soon()).expect("a write");
+        assert_eq!(read_exact(&*control, 4), b"pong");
+    }
+    for _ in 0..10 {
+        assert_eq!(read_exact(&*data, 4), b"data");
+    }
+    control.write(b"ping", soon()).expect("a write");
+    assert_eq!(read_exact(&*control, 4), b"pong");
+    control.write(b"stop", soon()).expect("a write");
+    // A few answers to pings may stand before it, as with a late device: not all of them.
+    let mut rest = Vec::new();
+    while !rest.ends_with(b"stopped") {
+        rest.extend(read_exact(&*control, 1));
+    }
+    assert!(rest.len() <= 4 * 4 + 7, "{rest:?}");
+}
+
 #[test]
 fn a_device_recorded_as_gone_is_gone_in_the_replay() {
     let folder = folder("gone");

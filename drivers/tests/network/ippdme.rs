@@ -432,9 +432,5 @@ fn the_logs_of_the_nist_suite_are_understood() {
         eprintln!("not understood: {line}");
     }
     assert!(lines > 7_000, "{lines}");
-    assert!(
-        wrong.len() <= 20,
-        "{} lines are not understood",
-        wrong.len()
-    );
+    assert!(wrong.is_empty(), "{} lines", wrong.len());
 }

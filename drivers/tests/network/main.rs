@@ -2,6 +2,7 @@
 
 mod cases;
 mod configs;
+mod conformance;
 mod gocator;
 mod ippdme;
 mod support;

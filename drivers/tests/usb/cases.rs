@@ -15,6 +15,7 @@ use acies_simulators::sensor::View;
 use acies_simulators::u3v::{self, Misdeeds, Surface};
 use acies_simulators::usb_itn::{self, Form, InputTool};
 
+use crate::hesitant::Hesitant;
 use crate::rig::{Device, Rig, SOON};
 
 /// One case: the devices it is run with, one after the other.
@@ -61,6 +62,11 @@ pub const CASES: &[Case] = &[
         run: unplugged_in_a_scan_and_back,
     },
     Case {
+        name: "unplugged_while_it_is_opened",
+        devices: examples,
+        run: unplugged_while_it_is_opened,
+    },
+    Case {
         name: "the_laser_goes_off",
         devices: sound,
         run: the_laser_goes_off,
@@ -104,6 +110,11 @@ pub const CASES: &[Case] = &[
         name: "a_system_short_of_memory_gets_fewer_transfers",
         devices: large_blocks,
         run: a_system_short_of_memory_gets_fewer_transfers,
+    },
+    Case {
+        name: "a_host_that_hesitates_loses_nothing_with_transfers_in_flight",
+        devices: not_waiting,
+        run: a_host_that_hesitates_loses_nothing_with_transfers_in_flight,
     },
     Case {
         name: "an_idle_device_is_asked",
@@ -160,7 +171,15 @@ fn text(error: &DeviceError) -> String {
 }
 
 fn open_with(rig: &dyn Rig, driver: &str, table: &str) -> Result<Box<dyn Profiler>, DeviceError> {
-    match setup(driver, table).open(rig.links())? {
+    open_over(rig.links(), driver, table)
+}
+
+fn open_over(
+    links: &dyn Links,
+    driver: &str,
+    table: &str,
+) -> Result<Box<dyn Profiler>, DeviceError> {
+    match setup(driver, table).open(links)? {
         Instrument::Profiler(profiler) => Ok(profiler),
         _ => panic!("no profiler"),
     }
@@ -473,6 +492,27 @@ fn unplugged_in_a_scan_and_back(rig: &dyn Rig, _: usize) {
     assert_eq!(profiles[0].sequence, 0);
 }
 
+/// The cable is pulled after each number of transfers that opening takes; afterwards it opens all the same.
+fn unplugged_while_it_is_opened(rig: &dyn Rig, variant: usize) {
+    let driver = ["u3v-profiler", "usb-itn"][variant];
+    let mut told = 0;
+    for transfers in 0.. {
+        let host = Hesitant::pulled_after(rig.links(), transfers);
+        let Err(error) = open_over(&host, driver, "") else {
+            break;
+        };
+        assert!(
+            error.may_pass() && text(&error).ends_with("plug it in again and reopen"),
+            "{transfers}: {}",
+            text(&error)
+        );
+        told += 1;
+    }
+    assert!(told > 1, "{told}");
+    let mut again = open_with(rig, driver, "").unwrap_or_else(|error| panic!("{}", text(&error)));
+    assert!(scan(again.as_mut(), 2).is_ok());
+}
+
 fn the_laser_goes_off(rig: &dyn Rig, _: usize) {
     let mut profiler = open(rig, "");
     profiler.start().expect("a start");
@@ -596,6 +636,58 @@ fn a_system_short_of_memory_gets_fewer_transfers(rig: &dyn Rig, _: usize) {
         "{}",
         text(&told)
     );
+}
+
+fn not_waiting() -> Vec<Device> {
+    let device = Device::U3v(Box::new(u3v::Setup {
+        triggered: true,
+        room_blocks: Some(ROOM),
+        ..u3v::Setup::new(SERIAL, Surface::Wave(320))
+    }));
+    vec![device.clone(), device]
+}
+
+/// Blocks that the device keeps, and those that it exposes while its host is busy elsewhere.
+const ROOM: usize = 2;
+const MEANWHILE: u64 = 8;
+
+/// A device that does not wait: what it exposes while the host is busy goes into the transfers that are in flight, all of it. With one transfer at a
+/// time there is none, and all is lost but what the device has room for. Either way each lost block is counted.
+fn a_host_that_hesitates_loses_nothing_with_transfers_in_flight(rig: &dyn Rig, variant: usize) {
+    const ROUNDS: u64 = 5;
+    let single = variant == 1;
+    let host = Hesitant::new(rig.links(), single);
+    let table = format!("usb_serial = '{SERIAL}'\nfirst_block = 0");
+    let mut profiler =
+        open_over(&host, "u3v-profiler", &table).unwrap_or_else(|error| panic!("{}", text(&error)));
+    profiler.start().expect("a start");
+    let mut taken = Vec::new();
+    let mut take = |sent: u64| {
+        while (taken.len() as u64) < sent {
+            let profile = profiler.next(Instant::now() + SOON).expect("a link");
+            taken.push(profile.expect("a profile in time").sequence);
+        }
+    };
+    // By the first one the stream is read.
+    rig.order("trigger 1");
+    take(rig.number("sent_count"));
+    for _ in 0..ROUNDS {
+        let busy = host.busy();
+        rig.order(&format!("trigger {MEANWHILE}"));
+        drop(busy);
+        take(rig.number("sent_count"));
+    }
+    // One more, by which the gap before it shows.
+    rig.order("trigger 1");
+    take(rig.number("sent_count"));
+    let lost = match single || !rig.overlaps() {
+        true => ROUNDS * (MEANWHILE - ROOM as u64),
+        false => 0,
+    };
+    let losses = profiler.losses();
+    assert_eq!((losses.lost_on_link, rig.number("overrun")), (lost, lost));
+    assert_eq!(losses.received + lost, rig.number("taken"));
+    assert!(taken.is_sorted_by(|a, b| a < b));
 }
 
 fn an_idle_device_is_asked(rig: &dyn Rig, variant: usize) {

@@ -24,8 +24,17 @@ pub fn folder() -> Option<PathBuf> {
 pub const NOT_CARRIED: (&str, usize) = ("itn_losses_are_exact", 2);
 
 enum AnyRedirected {
-    U3v { _device: Redirected<Profiler> },
-    Itn { _device: Redirected<InputTool> },
+    U3v(Redirected<Profiler>),
+    Itn(Redirected<InputTool>),
+}
+
+impl AnyRedirected {
+    fn offer(&self) {
+        match self {
+            AnyRedirected::U3v(device) => device.offer(),
+            AnyRedirected::Itn(device) => device.offer(),
+        }
+    }
 }
 
 /// A running machine.
@@ -96,7 +105,7 @@ impl Machine {
                     device.wait_until_configured(SOON),
                     "the kernel does not take it"
                 );
-                AnyRedirected::U3v { _device: device }
+                AnyRedirected::U3v(device)
             }
             Plug::Itn(socket) => {
                 let device = Redirected::start(stream, socket.clone())
@@ -105,7 +114,7 @@ impl Machine {
                     device.wait_until_configured(SOON),
                     "the kernel does not take it"
                 );
-                AnyRedirected::Itn { _device: device }
+                AnyRedirected::Itn(device)
             }
         }
     }
@@ -137,7 +146,7 @@ impl Machine {
                 }
                 // The kernel's own limit stays.
                 order if order.starts_with("memory") => "no system".into(),
-                order => plug.carry_out(order),
+                order => plug.carry_out(order, || plugged.iter().for_each(AnyRedirected::offer)),
             };
             assert!(
                 plugged.is_some() || order == "unplug" || order == "another" || order == "truth"

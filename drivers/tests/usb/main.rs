@@ -3,6 +3,7 @@
 //! the same cases through a real kernel instead.
 
 mod cases;
+mod hesitant;
 mod kernel;
 mod rig;
 

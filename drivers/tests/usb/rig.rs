@@ -36,6 +36,8 @@ pub trait Rig {
     fn links(&self) -> &dyn Links;
     /// Has something done to the device, or asks it.
     fn order(&self, order: &str) -> String;
+    /// Whether these links keep several transfers in flight.
+    fn overlaps(&self) -> bool;
 
     /// What the device says of itself, by name.
     fn truth(&self) -> BTreeMap<String, String> {
@@ -75,11 +77,12 @@ impl Plug {
                 let truth = device.truth();
                 let sent: Vec<String> = truth.sent.iter().map(u64::to_string).collect();
                 format!(
-                    "laser={} sent_count={} taken={} discarded={} commands={} starts={} sent={}",
+                    "laser={} sent_count={} taken={} discarded={} overrun={} commands={} starts={} sent={}",
                     u8::from(device.laser_on()),
                     truth.sent_count,
                     truth.taken,
                     truth.discarded,
+                    truth.overrun.len(),
                     truth.commands,
                     truth.starts,
                     sent.join(",")
@@ -105,8 +108,21 @@ impl Plug {
         }
     }
 
-    /// Does what needs no carrier.
-    pub fn carry_out(&self, order: &str) -> String {
+    /// Has so many blocks exposed, one after the other, and what waits for them answered in between.
+    fn trigger(&self, blocks: &str, offer: impl Fn()) {
+        let Plug::U3v(socket) = self else { return };
+        for _ in 0..blocks.parse().expect("a number") {
+            socket.with(Profiler::trigger);
+            offer();
+        }
+    }
+
+    /// Does what needs no carrier; `offer` has it answer what waits at once.
+    pub fn carry_out(&self, order: &str, offer: impl Fn()) -> String {
+        if let Some(blocks) = order.strip_prefix("trigger ") {
+            self.trigger(blocks, offer);
+            return String::new();
+        }
         match order {
             "truth" => return self.truth(),
             "press" => self.press(),
@@ -156,9 +172,13 @@ impl Rig for InProcess {
             "unplug" => plug.unplug(),
             "replug" => plug.replug(),
             order if order.starts_with("memory") => return "no system".into(),
-            order => return plug.carry_out(order),
+            order => return plug.carry_out(order, || {}),
         }
         String::new()
+    }
+
+    fn overlaps(&self) -> bool {
+        false
     }
 }
 
@@ -327,6 +347,10 @@ impl Rig for Child {
         let line = self.lines.borrow_mut().next();
         line.expect("the simulator").expect("an answer")
     }
+
+    fn overlaps(&self) -> bool {
+        true
+    }
 }
 
 enum AnyCarrier {
@@ -406,7 +430,12 @@ impl OverLibusb {
             ("unplug", AnyCarrier::Itn(carrier)) => carrier.unplug(),
             ("replug", AnyCarrier::U3v(carrier)) => carrier.replug().expect("a tree"),
             ("replug", AnyCarrier::Itn(carrier)) => carrier.replug().expect("a tree"),
-            (order, _) => return self.plug.carry_out(order),
+            (order, AnyCarrier::U3v(carrier)) => {
+                return self.plug.carry_out(order, || carrier.offer());
+            }
+            (order, AnyCarrier::Itn(carrier)) => {
+                return self.plug.carry_out(order, || carrier.offer());
+            }
         }
         String::new()
     }

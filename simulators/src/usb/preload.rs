@@ -206,6 +206,11 @@ impl<M: Model + 'static> Carrier<M> {
         lock(&self.shared.queue).memory = Some(bytes);
     }
 
+    /// Offers what waits to the device at once, as the host controller would; otherwise that happens every millisecond.
+    pub fn offer(&self) {
+        self.shared.offer(&mut lock(&self.shared.queue));
+    }
+
     /// Pulls the device out: what waits ends, and the device leaves the tree.
     pub fn unplug(&self) {
         self.shared.socket.unplug();

@@ -134,6 +134,12 @@ impl<M: Model + 'static> Redirected<M> {
         })
     }
 
+    /// Offers what waits to the device at once; otherwise that happens every millisecond.
+    pub fn offer(&self) {
+        // A peer that is gone takes nothing, and the thread that reads from it ends.
+        let _ = self.shared.offer();
+    }
+
     /// Waits until the guest's kernel has set the device up; false when `patience` is over before.
     pub fn wait_until_configured(&self, patience: Duration) -> bool {
         let until = Instant::now() + patience;
