@@ -8,13 +8,13 @@ use acies_drivers::device::{Identity, Instrument};
 use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
 use acies_drivers::link::recording::Recording;
-use acies_drivers::link::replay::{Match, Replay};
+use acies_drivers::link::replay::Replay;
 use anyhow::anyhow;
 use glam::DVec3;
 use serde::Serialize;
 use serde_json::json;
 
-use super::attached_device::{Configured, find, open, read_cell, run};
+use super::attached_device::{Configured, PLAYED, find, open, play, read_cell};
 use super::{Failure, Status, print_line};
 use crate::acquire::acceptance::{self, AcceptanceError};
 use crate::acquire::{Assembler, Profiling, scan};
@@ -373,16 +373,10 @@ impl Record<'_> {
     fn replay(&mut self, device: &Configured<'_>, source: &str) -> Result<PointCloud, Failure> {
         let recording = Recording::read(Path::new(source));
         let recording = recording.map_err(|error| Failure::BadInput(error.into()))?;
-        let links = Replay::new(recording, Match::Loose(Duration::from_millis(20)));
+        let links = Replay::new(recording, PLAYED);
         let mut profiling = profiling(device, &links)?;
         self.identity = Some(profiling.profiler.identity().clone());
-        let hour = Duration::from_secs(3600);
-        let run = run(
-            profiling.profiler.as_mut(),
-            usize::MAX,
-            hour,
-            Duration::from_secs(1),
-        )?;
+        let run = play(profiling.profiler.as_mut())?;
         let mut assembler = Assembler::new(source, profiling.calibration);
         run.profiles
             .iter()

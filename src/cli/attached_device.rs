@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use acies_drivers::capture::{Pose, Profile};
 use acies_drivers::device::{Identity, Instrument, Losses, Profiler, Robot, Setup};
 use acies_drivers::link::Links;
+use acies_drivers::link::replay::Match;
 use anyhow::anyhow;
 
 use super::Failure;
@@ -78,8 +79,21 @@ pub fn open(configured: &Configured<'_>, links: &dyn Links) -> Result<Instrument
         .map_err(|error| Failure::Io(error.into()))
 }
 
-/// A driver that writes at other moments than it did when recorded is waited for no longer than this.
-pub const PATIENCE: Duration = Duration::from_millis(20);
+/// How recordings are played: a driver that writes at other moments than it did when recorded is waited for no longer than this.
+pub const PLAYED: Match = Match::Loose(Duration::from_millis(20));
+
+/// Longest time that a recording is played.
+const PLAYED_FOR: Duration = Duration::from_secs(3600);
+
+/// All that a recorded profiler saw.
+pub fn play(profiler: &mut dyn Profiler) -> Result<Run, Failure> {
+    run(profiler, usize::MAX, PLAYED_FOR, Duration::from_secs(1))
+}
+
+/// All poses of a recorded robot.
+pub fn play_robot(robot: &mut dyn Robot) -> Result<RobotRun, Failure> {
+    run_robot(robot, usize::MAX, PLAYED_FOR)
+}
 
 /// What a run of a profiler brought.
 pub struct Run {

@@ -8,20 +8,17 @@ use acies_drivers::device::{Identity, Instrument, Profiler, Robot};
 use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
 use acies_drivers::link::recording::Recording;
-use acies_drivers::link::replay::{Match, Replay};
+use acies_drivers::link::replay::Replay;
 use anyhow::anyhow;
 use glam::DVec3;
 use serde_json::json;
 
-use super::attached_device::{Configured, PATIENCE, find, open, read_cell, run, run_robot};
+use super::attached_device::{Configured, PLAYED, find, open, play, play_robot, read_cell};
 use super::{Failure, Status, print_line};
 use crate::acquire::calibrate::{ProfilerCalibration, SphereScan, calibrate_profiler};
 use crate::acquire::lag::{Artefact, Lag, Pass, find_lag};
 use crate::acquire::{CarriedRecord, CarriedView, Carrier, Profiling, ScanEvent, run_carried};
 use crate::config::{CarrierConfig, Cell, ProfilerConfig};
-
-/// Longest time that a recording is played.
-const HOUR: Duration = Duration::from_secs(3600);
 
 /// Finds where a profiler stands and how the stage runs, from recordings of a reference sphere at known places.
 ///
@@ -232,12 +229,11 @@ impl LagDevices<'_> {
             )));
         }
         let began = Instant::now();
-        let played = |recording| Replay::of_run(recording, Match::Loose(PATIENCE), began);
+        let played = |recording| Replay::of_run(recording, PLAYED, began);
         let mut robot = self.open_robot(&played(arm))?;
-        let poses = run_robot(robot.as_mut(), usize::MAX, HOUR)?.poses;
+        let poses = play_robot(robot.as_mut())?.poses;
         let mut profiler = self.open_profiler(&played(line))?;
-        let silence = Duration::from_secs(1);
-        let profiles = run(profiler.as_mut(), usize::MAX, HOUR, silence)?.profiles;
+        let profiles = play(profiler.as_mut())?.profiles;
         CarriedRecord {
             views: vec![CarriedView {
                 device: &self.profiler.name,
@@ -339,13 +335,13 @@ fn replay(
     path: &Path,
 ) -> Result<(Identity, Vec<acies_drivers::capture::Profile>), Failure> {
     let recording = Recording::read(path).map_err(|error| Failure::BadInput(error.into()))?;
-    let links = Replay::new(recording, Match::Loose(PATIENCE));
+    let links = Replay::new(recording, PLAYED);
     let Instrument::Profiler(mut profiler) = open(device, &links)? else {
         return Err(Failure::Usage(anyhow!(
             "--device: a probe, expected a profiler"
         )));
     };
-    let run = run(profiler.as_mut(), usize::MAX, HOUR, Duration::from_secs(1))?;
+    let run = play(profiler.as_mut())?;
     Ok((profiler.identity().clone(), run.profiles))
 }
 

@@ -1,14 +1,13 @@
 //! `acies replay CELL.toml RECORDING`: a recording through the same driver, as if the device were there.
 
 use std::path::PathBuf;
-use std::time::Duration;
 
 use acies_drivers::device::Instrument;
 use acies_drivers::link::recording::Recording;
-use acies_drivers::link::replay::{Match, Replay};
+use acies_drivers::link::replay::Replay;
 
 use super::attached_device::{
-    PATIENCE, find, named, open, read_cell, robot_summary, run, run_robot, summary,
+    PLAYED, find, named, open, play, play_robot, read_cell, robot_summary, summary,
 };
 use super::{Failure, Status, print_line};
 use crate::acquire::Assembler;
@@ -42,12 +41,11 @@ impl ReplayCommand {
         for note in recording.notes() {
             print_line(&note)?;
         }
-        let links = Replay::new(recording, Match::Loose(PATIENCE));
+        let links = Replay::new(recording, PLAYED);
         match open(&device, &links)? {
             Instrument::Profiler(mut profiler) => {
                 print_line(&named(profiler.identity()))?;
-                let hour = Duration::from_secs(3600);
-                let run = run(profiler.as_mut(), usize::MAX, hour, Duration::from_secs(1))?;
+                let run = play(profiler.as_mut())?;
                 print_line(&summary(&run))?;
                 if let (Some(path), Some(calibration)) = (&self.output, device.calibration) {
                     let mut assembler = Assembler::new("replay", calibration);
@@ -61,9 +59,7 @@ impl ReplayCommand {
             }
             Instrument::Robot(mut robot) => {
                 print_line(&named(robot.identity()))?;
-                let hour = Duration::from_secs(3600);
-                let run = run_robot(robot.as_mut(), usize::MAX, hour)?;
-                print_line(&robot_summary(&run))?;
+                print_line(&robot_summary(&play_robot(robot.as_mut())?))?;
             }
             Instrument::Probe(probe) => print_line(&named(probe.identity()))?,
         }

@@ -270,3 +270,33 @@ pub fn towards(cloud: &PointCloud, i: usize) -> Option<DVec3> {
     let view = cloud.views.get(origin.view as usize)?;
     (view.towards_sensor != DVec3::ZERO).then_some(view.towards_sensor)
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::nominal::Nominal;
+
+    #[test]
+    fn noise_does_not_move_a_point_to_or_from_an_edge() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo/part.step");
+        let nominal = Nominal::read(&path).expect("the demo's part");
+        let surface = Surface::new(&nominal);
+        let mut found = Vec::new();
+        let mut near_an_edge = 0;
+        for sample in Nominal::samples(&nominal, 0.7) {
+            let [above, below] = [0.01, -0.01].map(|noise_mm| {
+                let p = sample.point + noise_mm * sample.normal;
+                surface.place_and_rim(p, None, 1.0, &mut found)
+            });
+            if above.0.face != below.0.face || above.1 > 2.0 {
+                continue;
+            }
+            near_an_edge += 1;
+            // Feet are found to far less.
+            assert!((above.1 - below.1).abs() < 1e-6, "{above:?}, {below:?}");
+        }
+        assert!(near_an_edge > 1_000, "{near_an_edge}");
+    }
+}

@@ -95,9 +95,8 @@ pub fn mend(
 ) -> Mending {
     /// Where more than one vertex in so many is wrong, umbrellas made no body to begin with.
     const NO_BODY: usize = 20;
-    let before = (defects(delaunay, stars, &solid.inside).iter())
-        .filter(|d| **d > 0)
-        .count();
+    let found = defects(delaunay, stars, &solid.inside);
+    let before = found.iter().filter(|d| **d > 0).count();
     if !is_wanted || before == 0 {
         return Mending {
             before,
@@ -107,14 +106,17 @@ pub fn mend(
     }
     let wish = solid.inside.clone();
     let all = (delaunay, stars, facets);
-    let first = search(all, solid, None);
+    let first = search(all, solid, found, None);
     if first.after == 0 && NO_BODY * before <= delaunay.points.len() {
         return first;
     }
     let mut other = solid.clone();
     other.inside = carve(delaunay, stars, facets, &wish);
-    let second = search(all, &mut other, Some(&wish));
-    let second = Mending { before, ..second };
+    let found = defects(delaunay, stars, &other.inside);
+    let second = Mending {
+        before,
+        ..search(all, &mut other, found, Some(&wish))
+    };
     let rank = |mending: &Mending, inside: &[bool]| {
         let t = topology(delaunay.points.len(), &surface(delaunay, inside));
         // Pieces and handles together.
@@ -138,14 +140,14 @@ fn defects(delaunay: &Delaunay, stars: &Stars, inside: &[bool]) -> Vec<u8> {
         .collect()
 }
 
-/// Searches around all wrong vertices; where the body was carved, for what is left of the `wish` as well.
+/// Searches around all vertices that have `defects`; where the body was carved, for what is left of the `wish` as well.
 fn search(
     (delaunay, stars, facets): (&Delaunay, &Stars, &Facets),
     solid: &mut Solid,
+    defects: Vec<u8>,
     wish: Option<&[bool]>,
 ) -> Mending {
     let count = delaunay.points.len() as u32;
-    let defects = defects(delaunay, stars, &solid.inside);
     let mut wrong: Vec<u32> = (0..count).filter(|v| defects[*v as usize] > 0).collect();
     let before = wrong.len();
     let mut search = Search {
