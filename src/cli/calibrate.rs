@@ -2,7 +2,7 @@
 //! from recordings.
 
 use std::path::{Path, PathBuf};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Instant, SystemTime};
 
 use acies_drivers::device::{Identity, Instrument, Profiler, Robot};
 use acies_drivers::link::Links;
