@@ -169,7 +169,9 @@ impl<'a, B: Body> Surface<'a, B> {
         gate_mm: f64,
         found: &mut Vec<(u32, f64)>,
     ) -> Place {
-        self.tree.nearest(p, CANDIDATES, found);
+        // No place of a face is nearer than its nearest sample less the sampling.
+        let reach_mm = gate_mm + 2.0 * self.spacing_mm;
+        self.tree.nearest_within(p, CANDIDATES, reach_mm, found);
         let mut best = Candidate::NONE;
         let mut faces = [NO_FACE; CANDIDATES];
         for (k, (index, squared)) in found.iter().enumerate() {
@@ -178,9 +180,7 @@ impl<'a, B: Body> Surface<'a, B> {
                 continue;
             }
             faces[k] = sample.face;
-            // No place of this face is nearer than its nearest sample less the sampling.
-            let limit = best.place.distance_mm.min(gate_mm);
-            if squared.sqrt() - 2.0 * self.spacing_mm > limit {
+            if squared.sqrt() - 2.0 * self.spacing_mm > best.place.distance_mm {
                 continue;
             }
             if let Some(new) = self.candidate(p, sample, towards, (f64::INFINITY, false))

@@ -86,6 +86,26 @@ impl Neighbors {
         }
     }
 
+    /// As [`Neighbors::nearest`], of the places nearer to `p` than `radius_mm` alone: far from all of them it costs almost nothing.
+    pub fn nearest_within(&self, p: DVec3, k: usize, radius_mm: f64, out: &mut Vec<(u32, f64)>) {
+        out.clear();
+        let finite = p.is_finite() && radius_mm.is_finite();
+        let (Some(tree), Some(k), true) = (&self.tree, NonZeroUsize::new(k), finite) else {
+            return;
+        };
+        let found = tree
+            .query(&self.inside(p))
+            .nearest_n::<SquaredEuclidean<f64>>(k)
+            .within(radius_mm * radius_mm)
+            .execute();
+        out.extend(
+            found
+                .iter()
+                .map(|hit| (self.places[hit.item as usize], hit.distance)),
+        );
+        sort_by_distance(out);
+    }
+
     /// Input indices of all finite points in an order that keeps neighbours together; queries in this order are the fastest.
     pub fn order(&self) -> &[u32] {
         &self.order
@@ -222,6 +242,13 @@ mod tests {
             prop_assert_eq!(found.len(), k.min(points.len()));
             for ((i, d2), expected) in found.iter().zip(&truth) {
                 prop_assert!((points[*i as usize].distance_squared(p) - expected).abs() < 1e-10);
+                prop_assert!((d2 - expected).abs() < 1e-10);
+            }
+
+            neighbors.nearest_within(p, k, radius, &mut found);
+            let inside = truth.iter().filter(|d| **d < radius * radius).count();
+            prop_assert_eq!(found.len(), k.min(inside));
+            for ((_, d2), expected) in found.iter().zip(&truth) {
                 prop_assert!((d2 - expected).abs() < 1e-10);
             }
 
