@@ -300,16 +300,20 @@ impl<'a, B: Body> Growing<'a, B> {
         self.surface.size_mm() / SKETCH
     }
 
-    /// The sketch as a scan of its own, spaced as its cells are.
-    fn sketch_scan<'s>(&'s self, neighbors: &'s Neighbors, noise_mm: f64) -> Scan<'s> {
+    /// The sketch as a scan of its own, spaced as its cells are, or as the scan is where that is wider.
+    fn sketch_scan<'s>(
+        &'s self,
+        neighbors: &'s Neighbors,
+        (spacing, noise_mm): (Spacing, f64),
+    ) -> Scan<'s> {
         let cell_mm = self.sketch_cell_mm();
         Scan {
             cloud: &self.sketch,
             neighbors,
             spacing: Spacing {
-                along_mm: cell_mm,
-                across_mm: cell_mm,
-                mean_mm: cell_mm,
+                along_mm: spacing.along_mm.max(cell_mm),
+                across_mm: spacing.across_mm.max(cell_mm),
+                mean_mm: spacing.mean_mm.max(cell_mm),
             },
             noise_mm,
         }
@@ -338,7 +342,7 @@ impl<'a, B: Body> Growing<'a, B> {
             return;
         }
         let neighbors = Neighbors::new(&self.sketch.positions);
-        let scan = self.sketch_scan(&neighbors, noise_mm);
+        let scan = self.sketch_scan(&neighbors, (spacing, noise_mm));
         let options = self.datums.options(&self.request);
         let (aligned, candidates) =
             align_keeping(&scan, &self.surface, self.request.start, &options);
@@ -418,9 +422,9 @@ impl<'a, B: Body> Growing<'a, B> {
         let Some(base) = &mut self.base else { return };
         base.asked = self.points;
         let known = (base.pose, &laid[..], base.spacing.along_mm);
-        let noise_mm = base.noise_mm;
+        let estimate = (base.spacing, base.noise_mm);
         let neighbors = Neighbors::new(&self.sketch.positions);
-        let scan = self.sketch_scan(&neighbors, noise_mm);
+        let scan = self.sketch_scan(&neighbors, estimate);
         let options = self.datums.options(&self.request);
         let settled = settle(&scan, &self.surface, self.request.start, &options, known);
         if let Some(pose) = settled {
@@ -449,7 +453,7 @@ impl<'a, B: Body> Growing<'a, B> {
     fn aligned(&self) -> Option<Aligned> {
         let base = self.base.as_ref()?;
         let neighbors = Neighbors::new(&self.sketch.positions);
-        let scan = self.sketch_scan(&neighbors, base.noise_mm);
+        let scan = self.sketch_scan(&neighbors, (base.spacing, base.noise_mm));
         let laid = self.laid(POSE_POINTS);
         let options = self.datums.options(&self.request);
         Some(align_again(

@@ -8,6 +8,7 @@ use crate::geometry::RigidTransform;
 use crate::geometry::fit::fit_plane;
 use crate::inspect::assign::{NO_FACE, Surface, towards};
 use crate::inspect::body::Body;
+use crate::points::PointCloud;
 
 /// Points of the scene: a feature that bears one in a hundred points is seen by some twenty.
 const POINTS: usize = 2400;
@@ -50,6 +51,9 @@ impl Scene {
                     let i = *i as usize;
                     let p = cloud.positions[i];
                     scan.neighbors.within(p, radius, found);
+                    if of_one_line(cloud, found) {
+                        return None;
+                    }
                     near.clear();
                     let some = found.iter().step_by(found.len().div_ceil(100).max(1));
                     near.extend(some.map(|(j, _)| cloud.positions[*j as usize]));
@@ -144,6 +148,19 @@ impl Scene {
             stray: places.iter().filter(|p| p.2).count(),
             distances,
         }
+    }
+}
+
+/// Whether `found` are points of one scan line, as on walls that fall off steeply: their plane is the laser's, not the part's.
+fn of_one_line(cloud: &PointCloud, found: &[(u32, f64)]) -> bool {
+    let line = |(i, _): &(u32, f64)| {
+        let origin = cloud.origins.get(*i as usize)?;
+        Some((origin.view, origin.profile))
+    };
+    let mut lines = found.iter().map(line);
+    match lines.next() {
+        Some(Some(first)) => lines.all(|line| line == Some(first)),
+        _ => false,
     }
 }
 
