@@ -34,6 +34,7 @@ use std::time::Instant;
 use glam::DVec3;
 
 pub use align::{AlignOptions, Start, Touch};
+pub use assign::{Sampled, Surface};
 pub use body::Body;
 pub use growing::{EdgeSoFar, Growing};
 pub use monte_carlo::MonteCarlo;
@@ -41,7 +42,6 @@ pub use recipe::Recipe;
 pub use result::Inspection;
 
 use align::{Aligned, DatumFeature, Scan, align};
-use assign::Surface;
 use attention::{Outline, Patches};
 use body::BodyEdge;
 use characteristic::{EdgeValues, at_station, characteristics};
@@ -104,6 +104,16 @@ impl<'a> Request<'a> {
 
 /// Inspects `cloud` against `nominal`. Bad data are findings of the result: there is no error.
 pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) -> Inspection {
+    inspect_on(cloud, &Surface::new(nominal), request)
+}
+
+/// As [`inspect`], of a nominal that has been sampled already.
+pub fn inspect_on<B: Body>(
+    cloud: &PointCloud,
+    surface: &Surface<'_, B>,
+    request: &Request<'_>,
+) -> Inspection {
+    let nominal = surface.body;
     let mut stages = Stages::new(request.progress);
     stages.begin("spacing and noise");
     let neighbors = Neighbors::new(&cloud.positions);
@@ -115,7 +125,6 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         noise_mm: noise_mm(cloud, &neighbors, &spacing),
     };
     stages.begin("alignment");
-    let surface = Surface::new(nominal);
     let mut findings = Vec::new();
     let datums = Datums::of(nominal, request.recipe, &mut findings);
     let options = datums.options(request);
@@ -123,7 +132,7 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
         mut alignment,
         findings: of_alignment,
         ..
-    } = align(&scan, &surface, request.start, &options);
+    } = align(&scan, surface, request.start, &options);
     findings.extend(of_alignment);
     if datums.unknown {
         alignment.status = Verdict::NotDecidable;
@@ -145,14 +154,14 @@ pub fn inspect<B: Body>(cloud: &PointCloud, nominal: &B, request: &Request<'_>) 
     let steps: Vec<Option<f64>> = resolved.iter().map(|r| r.station_step_mm).collect();
     let (measured, trials) = match &request.uncertainty {
         Uncertainty::FirstOrder => {
-            let edges = measure_edges_stepped(&part, &places, &surface, &settings, &steps);
+            let edges = measure_edges_stepped(&part, &places, surface, &settings, &steps);
             (edges, None)
         }
         Uncertainty::MonteCarlo(how) => {
             let given = (&settings, &steps[..]);
             let told = request.trials_done;
             let (edges, trials, kept) =
-                measure_edges_drawn(&part, &places, &surface, given, how, told);
+                measure_edges_drawn(&part, &places, surface, given, how, told);
             (edges, Some((trials, kept)))
         }
     };

@@ -1,7 +1,7 @@
 //! One job: touch, scan, find the pose, measure, conclude.
 
 use std::path::Path;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use acies_drivers::capture::Touch;
@@ -14,7 +14,7 @@ use super::meanwhile::{Feeding, Meanwhile, Show};
 use crate::acquire::{Carrier, Profiling, Scan, ScanEvent, ScanWatch, scan, scan_carried};
 use crate::config::{CarrierConfig, Cell, ProbeConfig};
 use crate::inspect::result::{Inspection, Verdict};
-use crate::inspect::{self, Recipe, Request, Start};
+use crate::inspect::{self, Recipe, Request, Sampled, Start, Surface};
 use crate::nominal::Nominal;
 use crate::report::{DeviceFacts, Facts, Report, ScanFacts};
 
@@ -63,6 +63,27 @@ pub struct Part {
     pub nominal_name: String,
     /// Limits and rules.
     pub recipe: Recipe,
+    sampled: OnceLock<Arc<Sampled>>,
+}
+
+impl Part {
+    /// Of a nominal read from a file of this name.
+    pub fn new(nominal: Nominal, nominal_name: String, recipe: Recipe) -> Self {
+        Self {
+            nominal,
+            nominal_name,
+            recipe,
+            sampled: OnceLock::new(),
+        }
+    }
+
+    /// The nominal ready for look-ups, sampled at the first time.
+    pub fn surface(&self) -> Surface<'_, Nominal> {
+        let sampled = self
+            .sampled
+            .get_or_init(|| Arc::new(Sampled::new(&self.nominal)));
+        Surface::sampled(&self.nominal, sampled.clone())
+    }
 }
 
 /// What a job brought.
@@ -175,11 +196,11 @@ pub fn check_recipe(text: &str, place: &str) -> Result<Recipe, CellError> {
 /// [`CellError::Nominal`], [`CellError::RecipeFile`] and [`CellError::Recipe`].
 pub fn read_part(cell: &Cell) -> Result<Part, CellError> {
     let name = cell.nominal.file_name().unwrap_or_default();
-    Ok(Part {
-        nominal: read_nominal(&cell.nominal)?,
-        nominal_name: name.to_string_lossy().into_owned(),
-        recipe: read_recipe(cell.recipe.as_deref())?,
-    })
+    Ok(Part::new(
+        read_nominal(&cell.nominal)?,
+        name.to_string_lossy().into_owned(),
+        read_recipe(cell.recipe.as_deref())?,
+    ))
 }
 
 pub(super) fn read_nominal(path: &Path) -> Result<Nominal, CellError> {
@@ -336,7 +357,7 @@ pub(super) fn conclude(cell: &Cell, mut acquired: Acquired, now: SystemTime) -> 
                 touches: &acquired.touches,
                 ..Request::new(&part.recipe, start)
             };
-            inspect::inspect(cloud, &part.nominal, &request)
+            inspect::inspect_on(cloud, &part.surface(), &request)
         });
     judge_completeness(&acquired.scan, &mut inspection);
     judge_calibrations(cell, now, &mut inspection);

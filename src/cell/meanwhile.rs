@@ -53,7 +53,7 @@ impl Meanwhile {
                 touches: &touches,
                 ..Request::new(&part.recipe, start)
             };
-            follow(Growing::new(&part.nominal, request), &receiver, show)
+            follow(Growing::new(part.surface(), request), &receiver, show)
         };
         let thread = thread::Builder::new().name("meanwhile".to_owned());
         let thread = thread.spawn(work).ok()?;

@@ -92,11 +92,9 @@ fn take(cell: &Cell, store: &Store, now: SystemTime) -> Result<Option<(i64, Part
         return Ok(None);
     }
     // Checked before it is taken: what the store holds can be read.
-    let part = Part {
-        recipe: check_recipe(&text, &place)?,
-        nominal: read_nominal(&cell.nominal)?,
-        nominal_name: nominal_name.to_string(),
-    };
+    let recipe = check_recipe(&text, &place)?;
+    let nominal = read_nominal(&cell.nominal)?;
+    let part = Part::new(nominal, nominal_name.to_string(), recipe);
     let version = store.add_recipe(&new, now)?;
     store.activate_recipe(version.id, new.author, new.why, now)?;
     store.note_configured(&new)?;
@@ -131,9 +129,9 @@ pub(super) fn load(content: &RecipeContent) -> Result<Part, CellError> {
         "recipe {} v{}",
         content.version.name, content.version.version
     );
-    Ok(Part {
-        nominal: read_nominal(&content.nominal)?,
-        nominal_name: content.version.nominal_name.clone(),
-        recipe: check_recipe(&content.text, &place)?,
-    })
+    Ok(Part::new(
+        read_nominal(&content.nominal)?,
+        content.version.nominal_name.clone(),
+        check_recipe(&content.text, &place)?,
+    ))
 }

@@ -2,6 +2,8 @@
 
 pub(in crate::inspect) mod grid;
 
+use std::sync::Arc;
+
 use glam::DVec3;
 use rayon::prelude::*;
 
@@ -26,6 +28,11 @@ const HORIZON: f64 = -0.05;
 pub struct Surface<'a, B: Body> {
     /// The nominal.
     pub body: &'a B,
+    sampled: Arc<Sampled>,
+}
+
+/// Samples of a nominal and what finds them: some tenths of a second of work, so that who inspects many parts keeps it.
+pub struct Sampled {
     samples: Vec<BodySample>,
     tree: Neighbors,
     grid: Grid,
@@ -55,16 +62,15 @@ const NOWHERE: Place = Place {
     distance_mm: f64::INFINITY,
 };
 
-impl<'a, B: Body> Surface<'a, B> {
+impl Sampled {
     /// Samples `body` finely enough that the nearest sample tells the nearest face: 1/200 of its diagonal.
-    pub fn new(body: &'a B) -> Self {
+    pub fn new<B: Body>(body: &B) -> Self {
         let [low, high] = body.bounds();
         let spacing_mm = ((high - low).length() / 200.0).max(1e-9);
         let samples = body.samples(spacing_mm);
         let points: Vec<DVec3> = samples.iter().map(|s| s.point).collect();
         let tree = Neighbors::new(&points);
         Self {
-            body,
             grid: Grid::new(body, &samples, &tree, spacing_mm),
             tree,
             samples,
@@ -73,30 +79,49 @@ impl<'a, B: Body> Surface<'a, B> {
             size_mm: (0.5 * (high - low).length()).max(1e-9),
         }
     }
+}
+
+impl std::fmt::Debug for Sampled {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let count = self.samples.len();
+        write!(f, "{count} samples {} mm apart", self.spacing_mm)
+    }
+}
+
+impl<'a, B: Body> Surface<'a, B> {
+    /// Samples `body`.
+    pub fn new(body: &'a B) -> Self {
+        Self::sampled(body, Arc::new(Sampled::new(body)))
+    }
+
+    /// With the samples that were made of `body`.
+    pub fn sampled(body: &'a B, sampled: Arc<Sampled>) -> Self {
+        Self { body, sampled }
+    }
 
     /// The samples of the nominal.
     pub fn samples(&self) -> &[BodySample] {
-        &self.samples
+        &self.sampled.samples
     }
 
     /// Half the diagonal of the nominal's bounds, mm.
     pub(super) fn size_mm(&self) -> f64 {
-        self.size_mm
+        self.sampled.size_mm
     }
 
     /// Distance of the samples, mm.
     pub fn spacing_mm(&self) -> f64 {
-        self.spacing_mm
+        self.sampled.spacing_mm
     }
 
     /// The sample nearest to `p` within a few spacings, seen from the nominal's box where `p` lies outside of it.
     pub(super) fn near(&self, p: DVec3) -> Option<&Near> {
-        self.grid.near(p)
+        self.sampled.grid.near(p)
     }
 
     /// As [`Surface::near`], three times as rough and faster.
     pub(super) fn rough(&self, p: DVec3) -> Option<&Near> {
-        self.grid.rough(p)
+        self.sampled.grid.rough(p)
     }
 
     /// The place of `p` on the nearest face whose outside is seen from `towards` (unit vector, where it is known), if it
@@ -109,10 +134,10 @@ impl<'a, B: Body> Surface<'a, B> {
         found: &mut Vec<(u32, f64)>,
     ) -> Place {
         let mut best = Candidate::NONE;
-        for candidate in self.grid.candidates(p) {
+        for candidate in self.sampled.grid.candidates(p) {
             let (index, middle) = sample_of(*candidate);
             let limit = (best.place.distance_mm, middle);
-            if let Some(new) = self.candidate(p, &self.samples[index], towards, limit)
+            if let Some(new) = self.candidate(p, &self.sampled.samples[index], towards, limit)
                 && new.place.distance_mm < best.place.distance_mm
             {
                 best = new;
@@ -141,8 +166,8 @@ impl<'a, B: Body> Surface<'a, B> {
             return (place, rim);
         }
         let on = p - place.deviation_mm * place.normal;
-        for candidate in self.grid.candidates(on) {
-            let sample = &self.samples[sample_of(*candidate).0];
+        for candidate in self.sampled.grid.candidates(on) {
+            let sample = &self.sampled.samples[sample_of(*candidate).0];
             if sample.face == place.face || self.pass_smoothly(sample.face, place.face) {
                 continue;
             }
@@ -158,7 +183,7 @@ impl<'a, B: Body> Surface<'a, B> {
 
     fn pass_smoothly(&self, a: u32, b: u32) -> bool {
         let pair = [a.min(b), a.max(b)];
-        self.smooth.binary_search(&pair).is_ok()
+        self.sampled.smooth.binary_search(&pair).is_ok()
     }
 
     /// The place by the nearest samples: wherever the cells do not tell.
@@ -170,17 +195,19 @@ impl<'a, B: Body> Surface<'a, B> {
         found: &mut Vec<(u32, f64)>,
     ) -> Place {
         // No place of a face is nearer than its nearest sample less the sampling.
-        let reach_mm = gate_mm + 2.0 * self.spacing_mm;
-        self.tree.nearest_within(p, CANDIDATES, reach_mm, found);
+        let reach_mm = gate_mm + 2.0 * self.sampled.spacing_mm;
+        self.sampled
+            .tree
+            .nearest_within(p, CANDIDATES, reach_mm, found);
         let mut best = Candidate::NONE;
         let mut faces = [NO_FACE; CANDIDATES];
         for (k, (index, squared)) in found.iter().enumerate() {
-            let sample = &self.samples[*index as usize];
+            let sample = &self.sampled.samples[*index as usize];
             if faces[..k].contains(&sample.face) {
                 continue;
             }
             faces[k] = sample.face;
-            if squared.sqrt() - 2.0 * self.spacing_mm > best.place.distance_mm {
+            if squared.sqrt() - 2.0 * self.sampled.spacing_mm > best.place.distance_mm {
                 continue;
             }
             if let Some(new) = self.candidate(p, sample, towards, (f64::INFINITY, false))

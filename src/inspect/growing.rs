@@ -96,13 +96,20 @@ struct Base<'a, B: Body> {
     pose: RigidTransform,
     spacing: Spacing,
     noise_mm: f64,
-    candidates: Candidates,
+    searched: Searched,
     outline: Outline,
     patches: Patches,
     measuring: Measuring<'a, B>,
-    /// Points of the scan when the pose was found, and when it was last asked whether it holds.
-    points: usize,
+    /// Points of the scan when it was last asked whether the pose holds.
     asked: usize,
+}
+
+/// What the search for the pose ended at.
+#[derive(Default)]
+struct Searched {
+    candidates: Candidates,
+    /// Points of the scan then.
+    points: usize,
 }
 
 /// What is known of an edge while the scan runs. Nothing is judged before its end.
@@ -121,8 +128,9 @@ pub struct EdgeSoFar {
 }
 
 impl<'a, B: Body> Growing<'a, B> {
-    /// Without points. Samples the nominal, which takes some tenths of a second.
-    pub fn new(nominal: &'a B, request: Request<'a>) -> Self {
+    /// Without points.
+    pub fn new(surface: Surface<'a, B>, request: Request<'a>) -> Self {
+        let nominal = surface.body;
         let mut findings = Vec::new();
         let datums = Datums::of(nominal, request.recipe, &mut findings);
         let facts = all_edge_facts(nominal);
@@ -131,7 +139,7 @@ impl<'a, B: Body> Growing<'a, B> {
         Self {
             nominal,
             request,
-            surface: Surface::new(nominal),
+            surface,
             datums,
             resolved,
             findings,
@@ -176,7 +184,7 @@ impl<'a, B: Body> Growing<'a, B> {
             cells: CellSet::default(),
         });
         let last = self.pieces.len() - 1;
-        let due = |base: &Base<'_, B>| self.points as f64 > AGAIN * base.points as f64;
+        let due = |base: &Base<'_, B>| self.points as f64 > AGAIN * base.searched.points as f64;
         if self.base.as_ref().is_none_or(due) {
             self.find_base();
         } else {
@@ -293,7 +301,7 @@ impl<'a, B: Body> Growing<'a, B> {
             all.positions.extend(&cloud.positions);
             all.origins.extend(&cloud.origins);
         }
-        super::inspect(&all, self.nominal, &self.request)
+        super::inspect_on(&all, &self.surface, &self.request)
     }
 
     fn sketch_cell_mm(&self) -> f64 {
@@ -333,7 +341,7 @@ impl<'a, B: Body> Growing<'a, B> {
         }
     }
 
-    /// Finds the pose by the points so far, and lays them all.
+    /// Searches for the pose by the points so far, and lays them all.
     fn find_base(&mut self) {
         let Some((spacing, noise_mm)) = self.estimator.estimate() else {
             return;
@@ -349,11 +357,15 @@ impl<'a, B: Body> Growing<'a, B> {
         self.set_base(
             aligned.alignment.part_from_machine,
             (spacing, noise_mm),
-            candidates,
+            Searched {
+                candidates,
+                points: self.points,
+            },
         );
     }
 
-    fn set_base(&mut self, pose: RigidTransform, known: (Spacing, f64), candidates: Candidates) {
+    /// Lays all points at `pose`, for a scan of this spacing and noise.
+    fn set_base(&mut self, pose: RigidTransform, known: (Spacing, f64), searched: Searched) {
         let (spacing, noise_mm) = known;
         let settings = measure_settings(&spacing, noise_mm, &self.request, &mut Vec::new());
         let steps: Vec<Option<f64>> = self.resolved.iter().map(|r| r.station_step_mm).collect();
@@ -363,11 +375,10 @@ impl<'a, B: Body> Growing<'a, B> {
             pose,
             spacing,
             noise_mm,
-            candidates,
+            searched,
             outline: Outline::new(self.nominal, measuring.edges(), near_mm),
             patches: Patches::default(),
             measuring,
-            points: self.points,
             asked: self.points,
         });
         for piece in 0..self.pieces.len() {
@@ -433,7 +444,7 @@ impl<'a, B: Body> Growing<'a, B> {
         }
     }
 
-    /// Finds a base where there is none, or anew where spacing or noise have turned out otherwise.
+    /// Finds a base where there is none, and lays all again where spacing or noise have turned out otherwise.
     fn renew_base(&mut self) {
         let Some((spacing, noise_mm)) = self.estimator.estimate() else {
             return;
@@ -444,8 +455,13 @@ impl<'a, B: Body> Growing<'a, B> {
                 || differs(base.spacing.across_mm, spacing.across_mm, SAME_SPACING)
                 || differs(base.noise_mm, noise_mm, SAME_NOISE)
         };
-        if self.base.as_ref().is_none_or(other) {
-            self.find_base();
+        let Some(base) = self.base.as_mut() else {
+            return self.find_base();
+        };
+        if other(base) {
+            let searched = std::mem::take(&mut base.searched);
+            let pose = base.pose;
+            self.set_base(pose, (spacing, noise_mm), searched);
         }
     }
 
@@ -461,7 +477,7 @@ impl<'a, B: Body> Growing<'a, B> {
             &self.surface,
             self.request.start,
             &options,
-            &base.candidates,
+            &base.searched.candidates,
             (base.pose, &laid, base.spacing.along_mm),
         ))
     }
@@ -512,12 +528,8 @@ impl<'a, B: Body> Growing<'a, B> {
             "the pose has moved too far: all points are laid again"
         );
         let known = (base.spacing, base.noise_mm);
-        let candidates = if goes_on {
-            std::mem::take(&mut base.candidates)
-        } else {
-            Vec::new()
-        };
-        self.set_base(pose, known, candidates);
+        let searched = std::mem::take(&mut base.searched);
+        self.set_base(pose, known, searched);
         true
     }
 }
@@ -555,5 +567,108 @@ fn so_far(id: String, edge: &MeasuredEdge, machine: &RigidTransform) -> EdgeSoFa
         mean_d_mm: edge.mean.map(|mean| mean.d_mm),
         worst_d_mm: stations.iter().map(|s| f64::from(s[3])).reduce(farther),
         stations,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use glam::DVec3;
+
+    use super::*;
+    use crate::nominal::Nominal;
+    use crate::points::{Origin, View};
+
+    /// Lines 0.8 mm apart over the demo's part, seen from aslant above, in pieces of ten lines; noise of 10 um.
+    fn coarse_lines(nominal: &Nominal) -> Vec<PointCloud> {
+        const APART_MM: f64 = 0.8;
+        let towards_sensor = DVec3::new(0.48, 0.36, 0.8);
+        let views = vec![View {
+            device: "aslant".to_owned(),
+            towards_sensor,
+        }];
+        let mut pieces: Vec<PointCloud> = Vec::new();
+        let mut state = 1u64;
+        for sample in Nominal::samples(nominal, 0.12) {
+            let line = (sample.point.x / APART_MM).round();
+            let beside_mm = line * APART_MM - sample.point.x;
+            let (n, flat) = (sample.normal, 1.0 - sample.normal.x.powi(2));
+            if n.dot(towards_sensor) < 0.2 || beside_mm.abs() > 0.07 || flat < 0.05 {
+                continue;
+            }
+            // Along the surface onto the line.
+            let on_line = sample.point + beside_mm / flat * (DVec3::X - n.x * n);
+            // Sums of twelve numbers from a congruential generator are near enough to normal.
+            let mut uniform = || {
+                state = state
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1);
+                (state >> 33) as f64 / (1u64 << 31) as f64
+            };
+            let noise_mm = 0.01 * ((0..12).map(|_| uniform()).sum::<f64>() - 6.0);
+            let profile = (line + 1000.0) as u32;
+            let piece = (profile - 1000) as usize / 10;
+            pieces.resize_with(pieces.len().max(piece + 1), || PointCloud {
+                views: views.clone(),
+                ..PointCloud::from_positions(Frame::Machine, Vec::new())
+            });
+            pieces[piece].positions.push(on_line + noise_mm * n);
+            pieces[piece].origins.push(Origin {
+                view: 0,
+                column: (sample.point.y.max(0.0) / 0.12) as u16,
+                profile,
+            });
+        }
+        pieces
+    }
+
+    fn demo_part() -> Nominal {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo/part.step");
+        Nominal::read(&path).expect("the demo's part")
+    }
+
+    #[test]
+    fn coarse_lines_are_aligned_as_they_come() {
+        let nominal = demo_part();
+        let recipe = super::super::Recipe::default();
+        let request = Request::new(&recipe, Start::Rough(RigidTransform::IDENTITY));
+        let mut growing = Growing::new(Surface::new(&nominal), request);
+        for piece in coarse_lines(&nominal) {
+            growing.push(piece);
+        }
+        let aligned = growing.aligned().expect("a pose");
+        assert_eq!(
+            aligned.conclusion,
+            Conclusion::Good,
+            "{:?}",
+            aligned.findings
+        );
+    }
+
+    #[test]
+    fn a_pose_that_turns_out_otherwise_on_the_way_is_left() {
+        let nominal = demo_part();
+        let recipe = super::super::Recipe::default();
+        let request = Request::new(&recipe, Start::Rough(RigidTransform::IDENTITY));
+        let mut growing = Growing::new(Surface::new(&nominal), request);
+        let pieces = coarse_lines(&nominal);
+        let (first, rest) = pieces.split_at(pieces.len() * 2 / 3);
+        first.iter().for_each(|piece| growing.push(piece.clone()));
+        // As if what was seen so far had misled: ten times the noise.
+        let away = RigidTransform::new(glam::DQuat::IDENTITY, DVec3::new(0.0, 0.0, 0.1));
+        let base = growing.base.take().expect("a base");
+        growing.set_base(
+            away * base.pose,
+            (base.spacing, base.noise_mm),
+            base.searched,
+        );
+        for piece in rest {
+            growing.push(piece.clone());
+            growing.measure();
+        }
+        let base = growing.base.as_ref().expect("a base");
+        let off = super::super::align::Twist::logarithm(&base.pose).size(growing.surface.size_mm());
+        assert!(off < SMALL_MOTION * base.noise_mm, "{off}");
     }
 }

@@ -6,7 +6,7 @@ use acies::geometry::RigidTransform;
 use acies::inspect::body::Body;
 use acies::inspect::quantity::Quantity;
 use acies::inspect::result::{Inspection, Verdict};
-use acies::inspect::{Growing, Recipe, Request, Start, inspect};
+use acies::inspect::{Growing, Recipe, Request, Start, Surface, inspect};
 use acies::points::{Frame, PointCloud};
 use glam::{DMat3, DVec2, DVec3};
 
@@ -450,7 +450,7 @@ fn a_part_measured_while_it_is_scanned_is_as_one_measured_afterwards() {
     let recipe = recipe("station_step_mm = 1.5\n[limits]\nd_mm = [-0.08, 0.08]");
     let request = || Request::new(&recipe, Start::Rough(RigidTransform::IDENTITY));
     let afterwards = inspect(&machine, &solid, &request());
-    let mut growing = Growing::new(&solid, request());
+    let mut growing = Growing::new(Surface::new(&solid), request());
     let mut so_far = Vec::new();
     for (k, piece) in pieces(&machine, 6).into_iter().enumerate() {
         growing.push(piece);

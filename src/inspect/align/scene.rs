@@ -214,3 +214,52 @@ impl Fit {
         here - there > DECISIVE * f64::sqrt(here + there).max(2.0)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::points::{Frame, Neighbors, Origin, Spacing, View};
+
+    #[test]
+    fn a_wall_of_lines_far_apart_has_the_wall_s_normal_or_none() {
+        // Lines every 1 mm of travel along x, on a wall that falls off as 1 in 6: there they lie 6 mm apart.
+        let wall = DVec3::new(6.0, 0.0, 1.0).normalize();
+        let mut cloud = PointCloud::from_positions(Frame::Machine, Vec::new());
+        cloud.views.push(View {
+            device: "above".to_owned(),
+            towards_sensor: DVec3::Z,
+        });
+        for profile in 0..40u32 {
+            for column in 0..200u16 {
+                let x = f64::from(profile) - 20.0;
+                let y = 0.1 * f64::from(column);
+                // A ripple of 5 um stands for noise.
+                let ripple = 0.005 * f64::from(i32::from(column * 7 % 5) - 2) / 2.0;
+                let on = DVec3::new(x, y, -6.0 * x.max(0.0));
+                let normal = if x > 0.0 { wall } else { DVec3::Z };
+                cloud.positions.push(on + ripple * normal);
+                cloud.origins.push(Origin {
+                    view: 0,
+                    column,
+                    profile,
+                });
+            }
+        }
+        let neighbors = Neighbors::new(&cloud.positions);
+        let scene = Scene::new(&Scan {
+            cloud: &cloud,
+            neighbors: &neighbors,
+            spacing: Spacing {
+                along_mm: 0.1,
+                across_mm: 1.0,
+                mean_mm: 0.3,
+            },
+            noise_mm: 0.005,
+        });
+        assert!(scene.points.len() > 500, "{}", scene.points.len());
+        for o in &scene.points {
+            let of_face = if o.point.x > 0.5 { wall } else { DVec3::Z };
+            assert!(o.normal.dot(of_face) > AGREES, "{o:?}");
+        }
+    }
+}
