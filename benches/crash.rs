@@ -155,7 +155,8 @@ fn one(folder: &Path, after: Duration, seen: &mut Seen) {
 
 /// Inspects without pause until it is killed.
 fn daemon(folder: &Path) {
-    demo::files_in(folder, |text| text);
+    // Several parts between two kills.
+    demo::files_in(folder, demo::coarse);
     let _playing = DemoCell::with_options(DemoOptions::new(1))
         .start(&folder.join("dev"))
         .expect("the devices");

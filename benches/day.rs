@@ -39,10 +39,7 @@ fn main() {
     let hours = numbers.first().copied().unwrap_or(24.0);
     let stored = numbers.get(1).map_or(1_000_000, |count| *count as i64);
     let folder = demo::files("day", |text| {
-        let coarse = "encoder_step = 400\ncolumns = 500\nrate_hz = 12.0";
-        let text = text.replace("encoder_step = 200", coarse);
-        // Where the last profile stands now.
-        let text = text.replace("end_count = 47200", "end_count = 46800");
+        let text = demo::coarse(text);
         text.replace("[part]\n", "[service]\nkeep_scans_gb = 0.2\n\n[part]\n")
     });
     drop(Store::open(&folder.join("store")).expect("a store"));

@@ -36,6 +36,14 @@ pub fn files_in(folder: &Path, change: impl FnOnce(String) -> String) {
     std::fs::write(folder.join("cell.toml"), change(text)).expect("the cell's file");
 }
 
+/// The demo's cell with profiles 0.8 mm apart of 500 columns, so that a part is measured in a fraction of a second.
+pub fn coarse(text: String) -> String {
+    let profiles = "encoder_step = 400\ncolumns = 500\nrate_hz = 12.0";
+    let text = text.replace("encoder_step = 200", profiles);
+    // Where the last profile stands now.
+    text.replace("end_count = 47200", "end_count = 46800")
+}
+
 /// A daemon on the cell in `folder`, and a client of it.
 pub struct Running {
     pub handle: Handle,
