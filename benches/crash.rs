@@ -43,7 +43,7 @@ fn main() {
         // A step of SplitMix64: fixed moments, spread over start-up, scan, computing and commit.
         random = random.wrapping_add(0x9e37_79b9_7f4a_7c15);
         let mixed = (random ^ (random >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let after = Duration::from_millis((mixed >> 40) % 6000);
+        let after = Duration::from_millis((mixed >> 40) % 10_000);
         one(&folder, after, &mut seen);
         if (kill + 1) % 20 == 0 {
             println!("{} kills: {seen:?}", kill + 1);
