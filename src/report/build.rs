@@ -278,7 +278,7 @@ fn edge_from_result(edge: &EdgeResult, facts: &Facts, findings: &mut Vec<String>
                 stations.push(station);
             }
             None => findings.push(format!(
-                "edge {}: the nominal place of station {index} {UNUSABLE}; the station is left out",
+                "edge {}: the nominal place of station {index} is not a number below 1e9; the station is left out",
                 edge.id
             )),
         }
@@ -448,8 +448,6 @@ fn gap_from_result(found: &GapResult) -> wire::Gap {
     }
 }
 
-const UNUSABLE: &str = "is not a number below 1e9";
-
 /// `None` where the nominal place itself is not finite.
 fn station_from_result(
     result: &StationResult,
@@ -523,7 +521,7 @@ fn fill_measured(station: &mut wire::Station, measured: &Measured) {
     let point = xyz(measured.point);
     let [d1, d2] = measured.d_mm.map(finite);
     let (Some(_), Some(_), Some(_)) = (point, d1, d2) else {
-        lower(station, &format!("the measured edge {UNUSABLE}"));
+        lower(station, "the measured edge is not a number below 1e9");
         return;
     };
     station.measured = point;
@@ -564,7 +562,7 @@ fn fill_measured(station: &mut wire::Station, measured: &Measured) {
     .into_iter()
     .filter(|(value, _)| value.is_none());
     for (_, name) in without {
-        lower(station, &format!("the {name} {UNUSABLE}"));
+        lower(station, &format!("the {name} is not a number below 1e9"));
     }
 }
 

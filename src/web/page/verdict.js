@@ -1,7 +1,7 @@
 // A verdict as a sign, a word and a colour: never the colour alone.
 
 import { h } from "./dom.js";
-import { number, signed, t, word } from "./text.js";
+import { number, said, signed, t, word } from "./text.js";
 
 export const SIGNS = { ok: "✓", not_ok: "✕", not_decidable: "?", undefined: "–", refused: "!", aborted: "!" };
 
@@ -50,17 +50,17 @@ export function valued(found) {
   return `${signed(found.value, places)}${spread}${unit}`;
 }
 
-/** Why a verdict is what it is, in the page's language; `found` is an inspection or a report. What an older version wrote stays English. */
+/** Why a verdict is what it is, in the page's language; `found` is an inspection or a report. */
 export function because(found) {
   const why = found.because;
-  if (!why) return found.reason;
+  if (!why) return said(found.reason);
   const judged = why.characteristic;
   const values = {
     edge: why.edge,
-    names: listed(why.names),
+    names: listed(why.names.map(said)),
     count: why.count,
     share: Math.round((why.coverage ?? 0) * 100),
-    detail: why.detail ? t("because.detail", { detail: why.detail }) : "",
+    detail: why.detail ? t("because.detail", { detail: said(why.detail) }) : "",
     others: why.count === 0 ? "" : t(why.count === 1 ? "because.other" : "because.others", { count: why.count }),
   };
   if (judged) {
@@ -75,7 +75,7 @@ export function because(found) {
 
 /** What to do next, in the page's language. */
 export function advised(found) {
-  return found.because ? t(`advised.${found.because.advice}`) : found.advice;
+  return found.because ? t(`advised.${found.because.advice}`) : said(found.advice);
 }
 
 /** At most five of them, then a count. */

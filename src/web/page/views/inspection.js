@@ -2,7 +2,7 @@
 
 import { get } from "../api.js";
 import { fill, h, table } from "../dom.js";
-import { bytes, count, number, t, time, word } from "../text.js";
+import { bytes, count, number, said, t, time, word } from "../text.js";
 import { advised, badge, because, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
 
 export function inspection(view, page, [id]) {
@@ -46,11 +46,11 @@ export function inspection(view, page, [id]) {
     view.append(worst, h("section.card", {}, h("h2", {}, t("report.frame")), frame));
     const report = await get(`/inspections/${found.id}/report.json`);
     const judged = worstFirst(report);
-    const rows = judged.slice(0, 40).map((one) => ({ cells: [badge(one.verdict), one.edge, word("quantity", one.quantity), valued(one), limits(one), one.reason] }));
+    const rows = judged.slice(0, 40).map((one) => ({ cells: [badge(one.verdict), one.edge, word("quantity", one.quantity), valued(one), limits(one), said(one.reason)] }));
     fill(worst, h("h2", {}, t("worst.first")), report.advice ? h("p", {}, advised(report)) : null,
       table(["verdict", "edge", "quantity", "value", "limits", "reason"].map((name) => t(`column.${name}`)), rows, [3, 4]),
       judged.length > 40 ? h("p.note", {}, t("more.in.report", { count: judged.length - 40 })) : null,
-      report.findings.length ? [h("h3", {}, t("findings")), h("ul", {}, report.findings.map((finding) => h("li", {}, finding)))] : null);
+      report.findings.length ? [h("h3", {}, t("findings")), h("ul", {}, report.findings.map((finding) => h("li", {}, said(finding))))] : null);
   }
 
   load();
