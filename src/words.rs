@@ -235,9 +235,8 @@ fn taken<'a>(names: &[&str], parts: &[&str], text: &'a str, values: &mut Vec<&'a
     else {
         return text.is_empty();
     };
-    let fits = |value: &str| {
-        !value.is_empty() && (!name.starts_with("number.") || is_number(value))
-    };
+    let fits =
+        |value: &str| !value.is_empty() && (!name.starts_with("number.") || is_number(value));
     if parts.is_empty() {
         let value = text.strip_suffix(part).filter(|value| fits(value));
         values.extend(value);
@@ -271,7 +270,10 @@ mod tests {
     #[test]
     fn a_sentence_is_told_in_german_with_what_was_filled_in() {
         let told = |english: &str| Language::De.said(english);
-        assert_eq!(told("no points on either flank"), "keine Punkte auf beiden Flanken");
+        assert_eq!(
+            told("no points on either flank"),
+            "keine Punkte auf beiden Flanken"
+        );
         assert_eq!(
             told("boundary: only flank 1 (face #12) was seen, no points on flank 2 (face #7)"),
             "Rand: nur Flanke 1 (Fläche #12) wurde erfasst, keine Punkte auf Flanke 2 (Fläche #7)"
@@ -281,11 +283,15 @@ mod tests {
             "Flanke 1 (Fläche #12): keine Punkte; Flanke 2 (Fläche #7): 3 Punkte, nötig sind 8"
         );
         assert_eq!(
-            told("flank 2 (face #7): points only 0.120 to 0.480 mm from the edge, too short a reach to extrapolate"),
+            told(
+                "flank 2 (face #7): points only 0.120 to 0.480 mm from the edge, too short a reach to extrapolate"
+            ),
             "Flanke 2 (Fläche #7): Punkte nur 0,120 bis 0,480 mm von der Kante, zu kurz zum Extrapolieren"
         );
         assert_eq!(
-            told("a limit of the edge radius lies inside its uncertainty; a limit of d1 lies inside its uncertainty"),
+            told(
+                "a limit of the edge radius lies inside its uncertainty; a limit of d1 lies inside its uncertainty"
+            ),
             "eine Grenze liegt innerhalb der Messunsicherheit: Kantenradius; eine Grenze liegt innerhalb der Messunsicherheit: d1"
         );
     }

@@ -26,7 +26,10 @@ const TOLD: &[&str] = &[
 const NOT_TOLD: &[(&str, &str)] = &[
     ("one was pushed", "a panic"),
     ("the figures are to be seen with --nocapture", "a lint"),
-    ("the pose has moved too far: all points are laid again", "the log"),
+    (
+        "the pose has moved too far: all points are laid again",
+        "the log",
+    ),
     ("acquisition {id}", "the name of a thread"),
     ("raw data not kept", "the log"),
     ("no result", "the log"),
@@ -99,9 +102,7 @@ fn literals(path: &Path) -> Vec<String> {
                     match c {
                         '"' => break,
                         '\\' => match chars.next() {
-                            Some('\n') => {
-                                while chars.next_if(|c| c.is_whitespace()).is_some() {}
-                            }
+                            Some('\n') => while chars.next_if(|c| c.is_whitespace()).is_some() {},
                             Some('n') => literal.push('\n'),
                             Some(other) => literal.push(other),
                             None => break,
@@ -161,7 +162,10 @@ fn every_row_is_a_sentence_of_the_program() {
 
 #[test]
 fn every_sentence_has_its_row() {
-    let known: BTreeSet<String> = sentences(Language::En).values().map(|text| shape(text)).collect();
+    let known: BTreeSet<String> = sentences(Language::En)
+        .values()
+        .map(|text| shape(text))
+        .collect();
     let mut missing = Vec::new();
     let mut seen = 0;
     for path in TOLD.iter().flat_map(|place| files(&root().join(place))) {
@@ -171,7 +175,9 @@ fn every_sentence_has_its_row() {
         }
         for literal in literals(&path) {
             let own = shape(&literal);
-            let words = own.split(' ').filter(|word| word.chars().any(char::is_alphabetic));
+            let words = own
+                .split(' ')
+                .filter(|word| word.chars().any(char::is_alphabetic));
             if words.count() < 2 || NOT_TOLD.iter().any(|(text, _)| *text == literal) {
                 continue;
             }
@@ -182,7 +188,11 @@ fn every_sentence_has_its_row() {
         }
     }
     assert!(seen > 150, "{seen} sentences");
-    assert_eq!(missing, Vec::<String>::new(), "no row said.* in src/words/texts.json");
+    assert_eq!(
+        missing,
+        Vec::<String>::new(),
+        "no row said.* in src/words/texts.json"
+    );
 }
 
 #[test]
@@ -195,12 +205,20 @@ fn every_row_is_recognised_in_its_own_words() {
             while let Some((before, after)) = rest.split_once('{') {
                 let (name, after) = after.split_once('}').expect("a place to fill");
                 out += before;
-                out += if name.starts_with("number.") { "12" } else { "Q7" };
+                out += if name.starts_with("number.") {
+                    "12"
+                } else {
+                    "Q7"
+                };
                 rest = after;
             }
             out + rest
         };
-        assert_eq!(Language::De.said(&sample(&english)), sample(&german[&key]), "{key}");
+        assert_eq!(
+            Language::De.said(&sample(&english)),
+            sample(&german[&key]),
+            "{key}"
+        );
     }
 }
 
@@ -213,7 +231,9 @@ fn both_languages_have_the_same_texts_with_the_same_places_to_fill() {
     let places = |text: &str| {
         let pieces = text.split('{').skip(1);
         let names = pieces.filter_map(|piece| piece.split_once('}'));
-        names.map(|(name, _)| name.to_owned()).collect::<BTreeSet<_>>()
+        names
+            .map(|(name, _)| name.to_owned())
+            .collect::<BTreeSet<_>>()
     };
     for (key, text) in english {
         assert!(!text.is_empty() && !german[key].is_empty(), "{key}");
@@ -224,9 +244,17 @@ fn both_languages_have_the_same_texts_with_the_same_places_to_fill() {
 /// The words of an enumeration in the report's schema.
 fn codes(schema: &Value, name: &str) -> Vec<String> {
     let definition = &schema["$defs"][name];
-    let cases = definition["oneOf"].as_array().or(definition["enum"].as_array());
+    let cases = definition["oneOf"]
+        .as_array()
+        .or(definition["enum"].as_array());
     let cases = cases.unwrap_or_else(|| panic!("{name} has cases"));
-    let word = |case: &Value| case["const"].as_str().or(case.as_str()).expect("a word").to_owned();
+    let word = |case: &Value| {
+        case["const"]
+            .as_str()
+            .or(case.as_str())
+            .expect("a word")
+            .to_owned()
+    };
     cases.iter().map(word).collect()
 }
 

@@ -17,6 +17,7 @@ use crate::inspect::result::{
     EdgeResult, GapResult, Inspection, Measured, Method, Quantified, StationResult, Verdict,
 };
 use crate::nominal::EdgeKind;
+use crate::words::Language;
 
 impl Report {
     /// The report of `inspection`, with `facts` beside it.
@@ -78,8 +79,8 @@ impl Report {
             seconds: seconds_by_stage(&inspection.seconds),
         };
         let because = conclusion::conclude(&report);
-        report.reason = because.reason();
-        report.advice = because.advice().to_owned();
+        report.reason = because.reason(Language::En);
+        report.advice = because.advice(Language::En);
         report.because = Some(because);
         report
     }

@@ -24,6 +24,9 @@ export function switchLanguage() {
   try { localStorage.setItem("language", language); } catch { /* then it holds until the page is closed */ }
 }
 
+/** The language of the page, as the API knows it. */
+export const spoken = () => language;
+
 /** The text of `key`, with {names} filled in. */
 export function t(key, values = {}) {
   const text = texts[language]?.[key] ?? key;

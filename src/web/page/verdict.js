@@ -65,17 +65,20 @@ export function because(found) {
   };
   if (judged) {
     const place = judged.s_mm === null ? "" : t("because.place", { s: number(judged.s_mm, 1) });
-    values.said = judged.value === null
-      ? t("because.unmeasured", { quantity: word("quantity", judged.quantity) })
-      : t("because.stated", { quantity: word("quantity", judged.quantity), value: valued(judged), place });
-    values.limits = limits(judged);
+    const quantity = word("quantity", judged.quantity);
+    if (judged.value !== null) values.said = t("because.stated", { quantity, value: valued(judged), place });
+    else if (why.detail) values.said = t("because.valueless", { quantity, detail: said(why.detail) });
+    else values.said = t("because.unmeasured", { quantity });
+    const between = limits(judged);
+    values.limits = between === "–" ? "" : t("because.limits", { limits: between });
   }
   return t(`because.${why.code}`, values);
 }
 
 /** What to do next, in the page's language. */
 export function advised(found) {
-  return found.because ? t(`advised.${found.because.advice}`) : said(found.advice);
+  const advice = found.because ? t(`advised.${found.because.advice}`) : said(found.advice);
+  return advice ? `${advice[0].toUpperCase()}${advice.slice(1)}.` : "";
 }
 
 /** At most five of them, then a count. */

@@ -2,7 +2,7 @@
 
 import { get } from "../api.js";
 import { fill, h, table } from "../dom.js";
-import { bytes, count, number, said, t, time, word } from "../text.js";
+import { bytes, count, number, said, spoken, t, time, word } from "../text.js";
 import { advised, badge, because, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
 
 export function inspection(view, page, [id]) {
@@ -38,10 +38,10 @@ export function inspection(view, page, [id]) {
         h("p.part", {}, `#${found.id} · ${found.part_serial}`), h("p.reason", { id: "reason" }, because(found))),
       h("section.card", {},
         h("dl.facts", {}, facts.map(([name, fact]) => h("div", {}, h("dt", {}, t(`fact.${name}`)), h("dd", {}, fact)))),
-        h("div.row", {}, done ? [link("report.json", "JSON"), link("report.csv", "CSV"), link("report.html", "HTML")] : null,
+        h("div.row", {}, done ? [link("report.json", "JSON"), link("report.csv", "CSV"), link(`report.html?language=${spoken()}`, "HTML")] : null,
           found.scan_bytes === null ? null : [link("scan.ply", "PLY"), link("scan.raw", t("raw.file"))])));
     if (!done) return;
-    const frame = h("iframe", { src: `${base}/report.html`, title: t("report.frame"), id: "report" });
+    const frame = h("iframe", { src: `${base}/report.html?language=${spoken()}`, title: t("report.frame"), id: "report" });
     const worst = h("section.card", {});
     view.append(worst, h("section.card", {}, h("h2", {}, t("report.frame")), frame));
     const report = await get(`/inspections/${found.id}/report.json`);
