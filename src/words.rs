@@ -23,7 +23,8 @@ static TEXTS: LazyLock<Texts> = LazyLock::new(|| {
 static SENTENCES: LazyLock<Vec<Sentence>> = LazyLock::new(|| {
     let rows = TEXTS["en"].iter();
     let mut all: Vec<Sentence> = rows
-        .filter_map(|(key, text)| key.starts_with("said.").then(|| Sentence::new(key, text)))
+        .filter(|(key, _)| key.starts_with("said."))
+        .map(|(key, text)| Sentence::new(key, text))
         .collect();
     // The row that says most of itself is the one that was meant.
     all.sort_by(|a, b| b.own.cmp(&a.own).then(a.key.cmp(b.key)));

@@ -63,7 +63,9 @@ fn the_page_is_german_where_that_is_asked_for() {
     let texts: serde_json::Value = serde_json::from_str(texts).expect("the table");
     let words = |text: &str| {
         let words = text.split_whitespace();
-        words.filter(|word| word.chars().any(char::is_alphabetic)).count()
+        words
+            .filter(|word| word.chars().any(char::is_alphabetic))
+            .count()
     };
     let mut looked = 0;
     for (key, english) in texts["en"].as_object().expect("texts by key") {

@@ -293,9 +293,7 @@ pub fn inspection(stations: usize) -> Inspection {
             ("edges", 0.22),
             ("comparison of edges found", 0.93),
         ],
-        findings: vec![
-            "213 of 412480 points were not finite and were left out".to_owned(),
-        ],
+        findings: vec!["213 of 412480 points were not finite and were left out".to_owned()],
         scan: None,
     };
     judge_again(&mut inspection, &facts().recipe);
