@@ -18,6 +18,8 @@ pub mod nominal;
 
 pub mod inspect;
 
+pub mod words;
+
 pub mod report;
 
 pub mod acquire;

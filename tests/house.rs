@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 /// The modules of `acies` in order of dependency: each uses only what stands before it.
 const ORDER: &[&str] = &[
-    "points", "geometry", "features", "surface", "mesh", "nominal", "inspect", "report", "acquire",
-    "store", "config", "cell", "web", "cli",
+    "points", "geometry", "features", "surface", "mesh", "nominal", "inspect", "words", "report",
+    "acquire", "store", "config", "cell", "web", "cli",
 ];
 
 /// What may stand at the top level.

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::OnceLock;
 
+use acies::words::Language;
 use serde_json::Value;
 
 fn acies(arguments: &[&str]) -> Output {
@@ -183,6 +184,36 @@ fn the_demos_files_are_whole() {
     );
     let scan = fs::read(folder.join("scan.ply")).expect("the scan");
     assert!(scan.starts_with(b"ply\nformat binary_little_endian 1.0\n"));
+}
+
+#[test]
+fn nothing_of_the_demos_report_is_left_in_english() {
+    let (folder, _) = demo();
+    let json = fs::read_to_string(folder.join("report.json")).expect("the report");
+    let report: acies::report::Report = serde_json::from_str(&json).expect("a report");
+    let stations = report.edges.iter().flat_map(|edge| &edge.stations);
+    let values = report.edges.iter().flat_map(|edge| &edge.characteristics);
+    let said = stations
+        .map(|station| &station.reason)
+        .chain(values.map(|value| &value.reason))
+        .chain(report.corners.iter().map(|corner| &corner.reason))
+        .chain(report.gaps.iter().map(|gap| &gap.reason))
+        .chain(&report.alignment.weak_directions)
+        .chain(&report.findings)
+        .chain(report.seconds.keys())
+        .filter(|text| !text.is_empty());
+    let mut seen = 0;
+    for english in said {
+        seen += 1;
+        let german = Language::De.said(english);
+        assert_ne!(&german, english);
+        for word in [" the ", " of ", " not ", " and ", " is ", "points"] {
+            assert!(!german.contains(word), "{german}");
+        }
+    }
+    assert!(seen > 50, "{seen} sentences");
+    let page = report.to_html(Language::De);
+    assert!(page.contains("<html lang=\"de\">") && page.contains("Deckungsgrad"));
 }
 
 #[test]

@@ -8,6 +8,7 @@ mod part;
 mod schema;
 
 use acies::report::Report;
+use acies::words::Language;
 
 fn report() -> Report {
     Report::new(&part::inspection(40), &part::facts())
@@ -123,11 +124,11 @@ fn a_page_of_fifty_edges_stays_below_one_and_a_half_megabytes() {
     let mut inspection = part::inspection(100);
     let edges = inspection.edges.clone();
     inspection.edges = edges.iter().cycle().take(50).cloned().collect();
-    let page = Report::new(&inspection, &part::facts()).to_html();
+    let page = Report::new(&inspection, &part::facts()).to_html(Language::En);
     assert!(page.len() < 1_500_000, "{} bytes", page.len());
     let edges = edges.iter().cycle().take(600).cloned().collect();
     inspection.edges = edges;
-    let page = Report::new(&inspection, &part::facts()).to_html();
+    let page = Report::new(&inspection, &part::facts()).to_html(Language::En);
     assert!(page.len() < 6_000_000, "{} bytes for 600 edges", page.len());
 }
 
@@ -137,12 +138,12 @@ fn a_page_stays_readable_whatever_the_number_of_stations_holes_and_findings() {
     inspection.edges.truncate(2);
     for station in inspection.edges[0].stations.iter_mut().step_by(2) {
         station.measured = None;
-        station.reason = "no points on flank 1".to_owned();
+        station.reason = "no points on either flank".to_owned();
     }
     inspection.findings = (0..9_000).map(|i| format!("finding {i}")).collect();
     inspection.unexpected_edges = vec![vec![glam::DVec3::ONE; 7]; 9_000];
     let report = Report::new(&inspection, &part::facts());
-    let page = report.to_html();
+    let page = report.to_html(Language::En);
     assert!(page.len() < 2_500_000, "{} bytes", page.len());
     for said in [
         "drawn; the CSV and JSON forms hold all",
@@ -161,6 +162,6 @@ fn a_page_stays_readable_whatever_the_number_of_stations_holes_and_findings() {
 #[test]
 fn the_page_is_kept_for_people_to_look_at() {
     let path = concat!(env!("CARGO_TARGET_TMPDIR"), "/report.html");
-    std::fs::write(path, report().to_html()).expect("the target folder can be written");
+    std::fs::write(path, report().to_html(Language::En)).expect("the target folder can be written");
     assert!(std::fs::metadata(path).expect("it was written").len() > 10_000);
 }

@@ -162,23 +162,32 @@ impl Assembler {
     pub fn finish(self) -> (PointCloud, Vec<String>) {
         let device = &self.cloud.views[0].device;
         let mut findings = Vec::new();
-        let mut find = |count: u64, what: &str| {
+        let mut find = |count: u64, sentence: String| {
             if count > 0 {
-                findings.push(format!("{device}: {count} {what}"));
+                findings.push(sentence);
             }
         };
+        let count = self.without_encoder;
         find(
-            self.without_encoder,
-            "profiles without an encoder value were left out",
+            count,
+            format!("{device}: {count} profiles without an encoder value were left out"),
         );
+        let count = self.jumps;
         find(
-            self.jumps,
-            "profiles whose encoder jumped were left out; check the encoder's cable",
+            count,
+            format!(
+                "{device}: {count} profiles whose encoder jumped were left out; check the encoder's cable"
+            ),
         );
-        find(self.reversals, "reversals of the stage during the scan");
+        let count = self.reversals;
         find(
-            self.repeats,
-            "profiles at the encoder count of the one before",
+            count,
+            format!("{device}: {count} reversals of the stage during the scan"),
+        );
+        let count = self.repeats;
+        find(
+            count,
+            format!("{device}: {count} profiles at the encoder count of the one before"),
         );
         (self.cloud, findings)
     }

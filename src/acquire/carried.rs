@@ -350,29 +350,29 @@ impl Unplaced {
     }
 
     fn findings(&self, device: &str, robot: &str) -> Vec<String> {
+        let [no_clock, missing, outside] = [self.no_clock, self.missing, self.outside];
         let told = [
             (
-                self.no_clock,
+                no_clock,
                 format!(
-                    "profiles without a usable time were left out; check that {device}'s clock is on"
+                    "{device}: {no_clock} profiles without a usable time were left out; check that {device}'s clock is on"
                 ),
             ),
             (
-                self.missing,
+                missing,
                 format!(
-                    "profiles were left out where {robot} sent no poses; check its network and its load"
+                    "{device}: {missing} profiles were left out where {robot} sent no poses; check its network and its load"
                 ),
             ),
             (
-                self.outside,
+                outside,
                 format!(
-                    "profiles lie before the first or after the last pose of {robot} and were left out"
+                    "{device}: {outside} profiles lie before the first or after the last pose of {robot} and were left out"
                 ),
             ),
         ];
         let told = told.into_iter().filter(|(count, _)| *count > 0);
-        told.map(|(count, what)| format!("{device}: {count} {what}"))
-            .collect()
+        told.map(|(_, sentence)| sentence).collect()
     }
 }
 

@@ -21,6 +21,7 @@ use crate::features::{self, Method};
 use crate::points::{Neighbors, write_scan};
 use crate::report::{Report, print_table, to_ply};
 use crate::store::Order;
+use crate::words::Language;
 
 /// What the demo's folder holds before the first scan.
 const FILES: [(&str, &str); 3] = [
@@ -45,6 +46,9 @@ pub struct Demo {
     /// Seed of the part's place, the noise and the faults: the same seed gives the same bytes.
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Language of the report's page.
+    #[arg(long, value_name = "LANGUAGE", default_value = "en")]
+    language: Language,
     /// A part as drawn, without defects.
     #[arg(long)]
     perfect: bool,
@@ -135,7 +139,7 @@ impl Demo {
     /// The report in its forms and the scan.
     fn write(&self, outcome: &Outcome, report: &Report) -> Result<(), Failure> {
         for name in ["report.json", "report.html", "report.csv"] {
-            let written = report.write_atomically(&self.output.join(name));
+            let written = report.write_atomically(&self.output.join(name), self.language);
             written.map_err(|error| Failure::Io(error.into()))?;
         }
         let cloud = &outcome.scan.cloud;

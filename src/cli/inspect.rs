@@ -14,6 +14,7 @@ use crate::inspect::{self, Inspection, MonteCarlo, Recipe, Request, Start, Uncer
 use crate::nominal::{Nominal, NominalError};
 use crate::points::{self, PointsError, Read, Unit};
 use crate::report::{Facts, Report, ScanFacts, print_table};
+use crate::words::Language;
 
 /// Measures every sharp edge of a scanned part against its CAD model.
 ///
@@ -51,6 +52,9 @@ pub struct Inspect {
     /// Write the report; the ending .json, .html or .csv says in which form. May be given several times.
     #[arg(short, long, value_name = "REPORT")]
     output: Vec<PathBuf>,
+    /// Language of the .html form. Data forms and the terminal are in English.
+    #[arg(long, value_name = "LANGUAGE", default_value = "en")]
+    language: Language,
     /// Print the report as one JSON object on standard output.
     #[arg(long)]
     json: bool,
@@ -117,10 +121,12 @@ impl Inspect {
         let facts = self.facts(&scan, recipe, &inspection);
         let report = Report::new(&inspection, &facts);
         for path in &self.output {
-            report.write_atomically(path).map_err(|error| match error {
-                crate::report::ReportError::UnknownForm { .. } => Failure::Usage(error.into()),
-                crate::report::ReportError::Write(_) => Failure::Io(error.into()),
-            })?;
+            report
+                .write_atomically(path, self.language)
+                .map_err(|error| match error {
+                    crate::report::ReportError::UnknownForm { .. } => Failure::Usage(error.into()),
+                    crate::report::ReportError::Write(_) => Failure::Io(error.into()),
+                })?;
         }
         if self.json {
             print_line(&report.to_json())?;

@@ -59,15 +59,11 @@ pub fn limits_from_pmi<B: Body>(
             .map(|e| format!("#{e}"))
             .collect();
         let more = entities.len().saturating_sub(NAMED);
-        let others = if more > 0 {
-            format!(" and {more} more")
-        } else {
-            String::new()
-        };
-        format!(
-            "PMI {}{others}: no limit of an edge: {why}",
-            named.join(", ")
-        )
+        let mut named = named.join(", ");
+        if more > 0 {
+            named = format!("{named} and {more} more");
+        }
+        format!("PMI {named}: no limit of an edge: {why}")
     });
     (limits, findings.collect())
 }

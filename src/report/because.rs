@@ -1,4 +1,4 @@
-//! Why a verdict is what it is, in parts: codes and values of which every language makes its own sentence.
+//! Why a verdict is what it is, in parts: codes and values of which the table of texts makes a sentence in either language.
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -6,6 +6,7 @@ use utoipa::ToSchema;
 
 use super::figure::Figure;
 use super::wire::{Characteristic, Quantity};
+use crate::words::Language;
 
 /// Which reason a verdict has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema, ToSchema)]
@@ -135,134 +136,121 @@ impl Because {
         }
     }
 
-    /// The reason in one English sentence.
-    pub fn reason(&self) -> String {
-        let edge = self.edge.as_deref().unwrap_or_default();
+    /// The reason in one sentence.
+    pub fn reason(&self, words: Language) -> String {
         let judged = self.characteristic.as_ref();
-        let said = judged.map_or(String::new(), |judged| judged.stated(&self.detail));
-        let limits = judged.map_or(String::new(), Judged::limits);
-        let others = others(self.count);
-        match self.code {
-            ReasonCode::OutsideLimits => {
-                format!("{edge}: {said}, outside its limits{limits}{others}")
-            }
-            ReasonCode::NoValue => format!("{edge}: {said}{limits}{others}"),
-            ReasonCode::EdgesMissing => format!(
-                "the scan has no edge where the nominal has {}",
-                list(&self.names)
-            ),
-            ReasonCode::EdgesOutside => format!("outside the limits: {}", list(&self.names)),
-            ReasonCode::PartNotOk => "the inspection found the part not OK".to_owned(),
-            ReasonCode::NotAligned => {
-                "the scan could not be aligned to the nominal well enough".to_owned()
-            }
-            ReasonCode::HeldWeakly => {
-                format!("the scan holds the part only weakly: {}", list(&self.names))
-            }
-            ReasonCode::LimitInsideUncertainty => {
-                format!("{edge}: {said}; a limit lies inside this uncertainty{limits}{others}")
-            }
-            ReasonCode::PartlyMeasured => {
-                let share = self.coverage.unwrap_or(0.0) * 100.0;
-                let detail = match self.detail.as_str() {
-                    "" => String::new(),
-                    detail => format!(" ({detail})"),
-                };
-                format!("{edge}: {share:.0} % of the edge was measured{detail}{others}")
-            }
-            ReasonCode::DataInadequate => "the data do not allow a verdict".to_owned(),
-            ReasonCode::AllWithin => format!(
-                "all {} values are within their limits; nearest to one is {edge}, where {said}{limits}",
-                self.count
-            ),
-            ReasonCode::NoneOutside => "nothing is outside its limits".to_owned(),
-            ReasonCode::NoSharpEdge => "the nominal has no sharp edge to measure".to_owned(),
-            ReasonCode::NothingMeasured => "no edge was measured".to_owned(),
-            ReasonCode::NoLimits => {
-                "no limits were given, so the values are stated and not judged".to_owned()
-            }
-        }
+        let said = judged.map_or(String::new(), |judged| judged.stated(&self.detail, words));
+        let limits = judged.and_then(|judged| judged.limits(words));
+        let limits = limits.map_or(String::new(), |limits| {
+            words.fill("because.limits", &[("limits", &limits)])
+        });
+        let detail = match self.detail.as_str() {
+            "" => String::new(),
+            detail => words.fill("because.detail", &[("detail", &words.said(detail))]),
+        };
+        let count = self.count.to_string();
+        let others = match self.count {
+            0 => String::new(),
+            1 => words.fill("because.other", &[]),
+            _ => words.fill("because.others", &[("count", &count)]),
+        };
+        words.fill(
+            &format!("because.{}", code(&self.code)),
+            &[
+                ("edge", self.edge.as_deref().unwrap_or_default()),
+                ("said", &said),
+                ("limits", &limits),
+                ("detail", &detail),
+                ("others", &others),
+                ("names", &list(&self.names, words)),
+                ("count", &count),
+                (
+                    "share",
+                    &format!("{:.0}", self.coverage.unwrap_or(0.0) * 100.0),
+                ),
+            ],
+        )
     }
 
-    /// What to do next, in one English sentence.
-    pub fn advice(&self) -> &'static str {
-        match self.advice {
-            AdviceCode::SetAside => {
-                "set the part aside; look at the marked place before anything is reworked"
-            }
-            AdviceCode::FixDirections => {
-                "scan surfaces that fix these directions, or touch datum faces, then measure again"
-            }
-            AdviceCode::MorePoints => {
-                "measure again with more points on both sides of the edge, so that the uncertainty shrinks"
-            }
-            AdviceCode::ScanAgain => {
-                "scan the missing stretches again, from a direction that sees both sides of the edge"
-            }
-            AdviceCode::Pass => "the part may pass",
-            AdviceCode::CheckNominal => "check that the right nominal was given",
-            AdviceCode::CheckUnit => {
-                "check that scan and nominal are the same part, in the same unit"
-            }
-            AdviceCode::GiveLimits => "give limits in a recipe to get a verdict",
-        }
+    /// What to do next, in one sentence.
+    pub fn advice(&self, words: Language) -> String {
+        words.fill(&format!("advised.{}", code(&self.advice)), &[])
     }
 }
 
 impl Judged {
     /// `d1 is +152 µm (U 12 µm) at 12.4 mm along the edge`; without a value why there is none.
-    pub fn stated(&self, detail: &str) -> String {
-        let name = self.quantity.words();
+    pub fn stated(&self, detail: &str, words: Language) -> String {
+        let quantity = words.said(self.quantity.words());
+        let quantity = ("quantity", quantity.as_str());
         let Some(value) = self.value else {
             return match detail {
-                "" => format!("{name} was not measured"),
-                reason => format!("{name} has no value: {reason}"),
+                "" => words.fill("because.unmeasured", &[quantity]),
+                reason => {
+                    let reason = words.said(reason);
+                    words.fill("because.valueless", &[quantity, ("detail", &reason)])
+                }
             };
         };
-        let figure = Figure::of(self.quantity, value, self.u);
-        let place = self
-            .s_mm
-            .map_or_else(String::new, |s| format!(" at {s:.1} mm along the edge"));
-        format!("{name} is {}{place}", figure.with_uncertainty())
+        let figure = Figure::of(self.quantity, value, self.u).told(words);
+        let place = self.s_mm.map_or_else(String::new, |s| {
+            let s = words.number(&format!("{s:.1}"));
+            words.fill("because.place", &[("s", &s)])
+        });
+        let value = figure.with_uncertainty(words);
+        words.fill(
+            "because.stated",
+            &[quantity, ("value", &value), ("place", &place)],
+        )
     }
 
-    /// ` (−100 to +100 µm)`.
-    fn limits(&self) -> String {
-        let figure = |limit| Figure::of(self.quantity, limit, None);
-        match (self.lower, self.upper) {
-            (Some(lower), Some(upper)) => {
-                format!(
-                    " ({} to {})",
-                    figure(lower).value,
-                    figure(upper).with_unit()
-                )
-            }
-            (None, Some(upper)) => format!(" (at most {})", figure(upper).with_unit()),
-            (Some(lower), None) => format!(" (at least {})", figure(lower).with_unit()),
-            (None, None) => String::new(),
-        }
+    /// `−100 to +100 µm`; `None` without limits.
+    pub fn limits(&self, words: Language) -> Option<String> {
+        limits_between(self.quantity, [self.lower, self.upper], words)
     }
 }
 
-fn others(count: usize) -> String {
-    match count {
-        0 => String::new(),
-        1 => "; one more edge likewise".to_owned(),
-        more => format!("; {more} more edges likewise"),
-    }
+/// `−100 to +100 µm`; `None` without limits.
+pub fn limits_between(
+    quantity: Quantity,
+    limits: [Option<f64>; 2],
+    words: Language,
+) -> Option<String> {
+    let figure = |limit| Figure::of(quantity, limit, None).told(words);
+    let told = match limits {
+        [Some(low), Some(high)] => {
+            let (low, high) = (figure(low).value, figure(high).with_unit());
+            words.fill("because.from_to", &[("lower", &low), ("upper", &high)])
+        }
+        [None, Some(high)] => {
+            words.fill("because.at_most", &[("upper", &figure(high).with_unit())])
+        }
+        [Some(low), None] => words.fill("because.at_least", &[("lower", &figure(low).with_unit())]),
+        [None, None] => return None,
+    };
+    Some(told)
+}
+
+/// The word by which the wire knows a case.
+pub fn code(case: &impl Serialize) -> String {
+    let word = serde_json::to_value(case).expect("a case without fields is a word");
+    word.as_str().unwrap_or_default().to_owned()
 }
 
 /// At most five words of a list, then a count.
-fn list(items: &[String]) -> String {
+fn list(items: &[String], words: Language) -> String {
     const SHOWN: usize = 5;
-    let shown = items
+    let shown: Vec<String> = items
         .iter()
         .take(SHOWN)
-        .cloned()
-        .collect::<Vec<_>>()
-        .join(", ");
+        .map(|item| words.said(item))
+        .collect();
+    let shown = shown.join(", ");
     match items.len().saturating_sub(SHOWN) {
         0 => shown,
-        more => format!("{shown} and {more} more"),
+        more => words.fill(
+            "because.more",
+            &[("names", &shown), ("count", &more.to_string())],
+        ),
     }
 }

@@ -17,6 +17,7 @@ use crate::inspect::result::{
     EdgeResult, GapResult, Inspection, Measured, Method, Quantified, StationResult, Verdict,
 };
 use crate::nominal::EdgeKind;
+use crate::words::Language;
 
 impl Report {
     /// The report of `inspection`, with `facts` beside it.
@@ -78,8 +79,8 @@ impl Report {
             seconds: seconds_by_stage(&inspection.seconds),
         };
         let because = conclusion::conclude(&report);
-        report.reason = because.reason();
-        report.advice = because.advice().to_owned();
+        report.reason = because.reason(Language::En);
+        report.advice = because.advice(Language::En);
         report.because = Some(because);
         report
     }
@@ -278,7 +279,7 @@ fn edge_from_result(edge: &EdgeResult, facts: &Facts, findings: &mut Vec<String>
                 stations.push(station);
             }
             None => findings.push(format!(
-                "edge {}: the nominal place of station {index} {UNUSABLE}; the station is left out",
+                "edge {}: the nominal place of station {index} is not a number below 1e9; the station is left out",
                 edge.id
             )),
         }
@@ -448,8 +449,6 @@ fn gap_from_result(found: &GapResult) -> wire::Gap {
     }
 }
 
-const UNUSABLE: &str = "is not a number below 1e9";
-
 /// `None` where the nominal place itself is not finite.
 fn station_from_result(
     result: &StationResult,
@@ -523,7 +522,7 @@ fn fill_measured(station: &mut wire::Station, measured: &Measured) {
     let point = xyz(measured.point);
     let [d1, d2] = measured.d_mm.map(finite);
     let (Some(_), Some(_), Some(_)) = (point, d1, d2) else {
-        lower(station, &format!("the measured edge {UNUSABLE}"));
+        lower(station, "the measured edge is not a number below 1e9");
         return;
     };
     station.measured = point;
@@ -564,7 +563,7 @@ fn fill_measured(station: &mut wire::Station, measured: &Measured) {
     .into_iter()
     .filter(|(value, _)| value.is_none());
     for (_, name) in without {
-        lower(station, &format!("the {name} {UNUSABLE}"));
+        lower(station, &format!("the {name} is not a number below 1e9"));
     }
 }
 

@@ -2,6 +2,7 @@
 
 use super::wire::Quantity;
 use crate::inspect::quantity::Unit;
+use crate::words::Language;
 
 /// Coverage factor of the uncertainties shown to people: about 95 % of a normal distribution.
 pub const COVERAGE_FACTOR: f64 = 2.0;
@@ -35,6 +36,15 @@ impl Figure {
         }
     }
 
+    /// The same with the decimal sign of a language.
+    pub fn told(self, words: Language) -> Self {
+        Figure {
+            value: words.number(&self.value),
+            expanded: self.expanded.map(|expanded| words.number(&expanded)),
+            unit: self.unit,
+        }
+    }
+
     /// `+152 µm`.
     pub fn with_unit(&self) -> String {
         match self.unit {
@@ -52,11 +62,15 @@ impl Figure {
     }
 
     /// `+152 µm (U 12 µm)`.
-    pub fn with_uncertainty(&self) -> String {
+    pub fn with_uncertainty(&self, words: Language) -> String {
         let space = if self.unit == "°" { "" } else { " " };
+        let value = self.with_unit();
         match &self.expanded {
-            Some(expanded) => format!("{} (U {expanded}{space}{})", self.with_unit(), self.unit),
-            None => format!("{} (U unknown)", self.with_unit()),
+            Some(expanded) => {
+                let u = format!("{expanded}{space}{}", self.unit);
+                words.fill("because.with_u", &[("value", &value), ("u", &u)])
+            }
+            None => words.fill("because.without_u", &[("value", &value)]),
         }
     }
 }
@@ -120,6 +134,6 @@ mod tests {
     fn angles_are_in_degrees() {
         let figure = Figure::of(Quantity::AngleDeviation, -0.204, Some(0.021));
         assert_eq!(figure.plus_minus(), "−0.204 ± 0.042");
-        assert_eq!(figure.with_uncertainty(), "−0.204° (U 0.042°)");
+        assert_eq!(figure.with_uncertainty(Language::En), "−0.204° (U 0.042°)");
     }
 }

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use super::Report;
 use crate::points::PointsError;
 use crate::points::write::write_atomically;
+use crate::words::Language;
 
 /// Why a report could not be written.
 #[derive(Debug, thiserror::Error)]
@@ -25,15 +26,15 @@ pub enum ReportError {
 }
 
 impl Report {
-    /// Writes the form that the ending of `path` names, so that a power cut leaves the old file or the new one.
+    /// Writes the form that the ending of `path` names, the page in the language `words`, so that a power cut leaves the old file or the new one.
     ///
     /// # Errors
     /// [`ReportError::UnknownForm`] before anything is written; [`ReportError::Write`] when the disk refuses.
-    pub fn write_atomically(&self, path: &Path) -> Result<(), ReportError> {
+    pub fn write_atomically(&self, path: &Path, words: Language) -> Result<(), ReportError> {
         let ending = path.extension().map(|ending| ending.to_string_lossy());
         let text = match ending.as_deref().map(str::to_ascii_lowercase).as_deref() {
             Some("json") => self.to_json(),
-            Some("html" | "htm") => self.to_html(),
+            Some("html" | "htm") => self.to_html(words),
             Some("csv") => self.to_csv(),
             _ => {
                 return Err(ReportError::UnknownForm {

@@ -15,10 +15,10 @@ use base64::Engine as _;
 use sha2::{Digest, Sha256};
 
 use super::conclusion::used_share;
-use super::figure::Figure;
 use super::wire::{Characteristic, Edge, Kind, Quantity, Report, Status};
+use crate::words::Language;
 use drawing::Drawing;
-use page::{Escaped, PlusMinus, SYMBOLS, State, class, word};
+use page::{Escaped, Paper, PlusMinus, SYMBOLS, class, word};
 
 const STYLE: &str = include_str!("html/style.css");
 const SCRIPT: &str = include_str!("html/viewer.js");
@@ -28,19 +28,18 @@ const STATIONS_DRAWN: usize = 6000;
 
 impl Report {
     /// The report as a self-contained page.
-    pub fn to_html(&self) -> String {
-        self.page(&[])
+    pub fn to_html(&self, words: Language) -> String {
+        self.to_html_with_links(words, &[])
     }
 
     /// The page with links to the other forms, where a server has them: (address, name).
-    pub fn to_html_with_links(&self, links: &[(&str, &str)]) -> String {
-        self.page(links)
-    }
-
-    fn page(&self, links: &[(&str, &str)]) -> String {
-        let mut out = String::with_capacity(1 << 18);
+    pub fn to_html_with_links(&self, words: Language, links: &[(&str, &str)]) -> String {
+        let mut out = Paper {
+            text: String::with_capacity(1 << 18),
+            words,
+        };
         write_page(&mut out, self, links).expect("writing to a String cannot fail");
-        out
+        out.text
     }
 }
 
@@ -58,7 +57,7 @@ fn hash(text: &str) -> String {
     format!("sha256-{digest}")
 }
 
-fn write_page(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt::Result {
+fn write_page(out: &mut Paper, report: &Report, links: &[(&str, &str)]) -> fmt::Result {
     let shown: Vec<_> = report
         .edges
         .iter()
@@ -66,14 +65,15 @@ fn write_page(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt:
         .collect();
     write!(
         out,
-        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+        "<!DOCTYPE html>\n<html lang=\"{}\">\n<head>\n<meta charset=\"utf-8\">\n\
          <meta http-equiv=\"Content-Security-Policy\" content=\"{}\">\n\
          <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
          <meta name=\"generator\" content=\"{} {}\">\n<title>{}: {}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n{SYMBOLS}",
+        out.words.code(),
         content_security_policy(),
         Escaped(&report.software.name),
         Escaped(&report.software.version),
-        word(report.verdict),
+        word(out.words, report.verdict),
         Escaped(&report.part)
     )?;
     write_header(out, report, links)?;
@@ -90,7 +90,7 @@ fn write_page(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt:
     write_footer(out, report)?;
     if !drawing.is_empty() {
         // Inside a script element only `<` could end it early.
-        let data = drawing.data().to_string().replace('<', "\\u003c");
+        let data = drawing.data(out).to_string().replace('<', "\\u003c");
         writeln!(
             out,
             r#"<script type="application/json" id="view-data">{data}</script>"#
@@ -127,20 +127,24 @@ fn stations_shown(edge: &Edge, edges: usize) -> Vec<usize> {
     shown
 }
 
-fn write_header(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fmt::Result {
+fn write_header(out: &mut Paper, report: &Report, links: &[(&str, &str)]) -> fmt::Result {
+    let created = report.created.replace('T', " ").replace('Z', " UTC");
     write!(
         out,
-        "<header>\n<a class=\"skip\" href=\"#edges\">Skip to the edges</a>\n<h1>{}</h1>\n<p class=\"soft\">measured {} against {}",
+        "<header>\n<a class=\"skip\" href=\"#edges\">{}</a>\n<h1>{}</h1>\n<p class=\"soft\">{}",
+        Escaped(&out.t("skip")),
         Escaped(&report.part),
-        Escaped(&report.created.replace('T', " ").replace('Z', " UTC")),
-        Escaped(&report.nominal)
+        Escaped(&out.with(
+            "against",
+            &[("created", &created), ("nominal", &report.nominal)]
+        ))
     )?;
     if report.simulated {
-        out.write_str(" <span class=\"tag\">SIMULATED</span>")?;
+        out.put(" <span class=\"tag\">[[simulated]]</span>")?;
     }
     out.write_str("</p>\n")?;
     if !links.is_empty() {
-        out.write_str("<nav class=\"small\" aria-label=\"Other forms\">")?;
+        out.put("<nav class=\"small\" aria-label=\"[[forms]]\">")?;
         for (address, name) in links {
             write!(
                 out,
@@ -152,13 +156,19 @@ fn write_header(out: &mut String, report: &Report, links: &[(&str, &str)]) -> fm
         out.write_str("</nav>\n")?;
     }
     let class = class(report.verdict);
+    let words = out.words;
+    let (reason, advice) = match &report.because {
+        Some(because) => (because.reason(words), because.advice(words)),
+        None => (words.said(&report.reason), words.said(&report.advice)),
+    };
     writeln!(
         out,
-        "<section class=\"verdict bg-{class}\" aria-label=\"Verdict\"><svg aria-hidden=\"true\" viewBox=\"0 0 24 24\"><use href=\"#i-{class}\"/></svg>\
+        "<section class=\"verdict bg-{class}\" aria-label=\"{}\"><svg aria-hidden=\"true\" viewBox=\"0 0 24 24\"><use href=\"#i-{class}\"/></svg>\
          <div><strong>{}</strong><p>{}</p><p class=\"advice\">{}</p></div></section>\n</header>",
-        word(report.verdict),
-        Escaped(&sentence(&report.reason)),
-        Escaped(&sentence(&report.advice))
+        Escaped(&out.t("verdict")),
+        word(out.words, report.verdict),
+        Escaped(&sentence(&reason)),
+        Escaped(&sentence(&advice))
     )
 }
 
@@ -174,22 +184,19 @@ fn sentence(text: &str) -> String {
     }
 }
 
-fn write_table(out: &mut String, report: &Report) -> fmt::Result {
-    out.write_str(
-        "<section class=\"card\" id=\"edges\"><h2>Edges</h2>\n<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"Table of edges\">\
-         <table class=\"edges\"><thead><tr><th scope=\"col\">Edge</th><th scope=\"col\">Verdict</th>\
-         <th scope=\"col\" class=\"n\">d1 worst<br>± U, µm</th><th scope=\"col\" class=\"n\">d2 worst<br>± U, µm</th>\
-         <th scope=\"col\" class=\"n\">angle deviation<br>worst ± U, °</th><th scope=\"col\">measured</th>\
-         <th scope=\"col\" class=\"n\">length<br>mm</th><th scope=\"col\">kind</th><th scope=\"col\" class=\"n\">STEP</th></tr></thead>\n<tbody>\n",
+fn write_table(out: &mut Paper, report: &Report) -> fmt::Result {
+    out.put(
+        "<section class=\"card\" id=\"edges\"><h2>[[edges]]</h2>\n<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"[[edges.table]]\">\
+         <table class=\"edges\"><thead><tr><th scope=\"col\">[[edge]]</th><th scope=\"col\">[[verdict]]</th>\
+         <th scope=\"col\" class=\"n\">[[d1.worst]]<br>[[pm.um]]</th><th scope=\"col\" class=\"n\">[[d2.worst]]<br>[[pm.um]]</th>\
+         <th scope=\"col\" class=\"n\">[[angle.deviation]]<br>[[worst.pm.deg]]</th><th scope=\"col\">[[measured]]</th>\
+         <th scope=\"col\" class=\"n\">[[length]]<br>mm</th><th scope=\"col\">[[kind]]</th><th scope=\"col\" class=\"n\">STEP</th></tr></thead>\n<tbody>\n",
     )?;
     for index in worst_first(report) {
         write_row(out, index, &report.edges[index])?;
     }
     out.write_str("</tbody></table></div>\n")?;
-    out.write_str(
-        "<p class=\"small soft\">d1 and d2 are the distances of the measured edge from the nominal one, along the outward normals of its two faces; \
-         plus is material outside the nominal. U is twice the standard uncertainty: about 95 % of values lie within it.</p></section>\n",
-    )
+    out.put("<p class=\"small soft\">[[edges.note]]</p></section>\n")
 }
 
 /// The edges by verdict, then by how much of their limits they use.
@@ -208,18 +215,18 @@ fn worst_first(report: &Report) -> Vec<usize> {
     order
 }
 
-fn write_row(out: &mut String, index: usize, edge: &Edge) -> fmt::Result {
+fn write_row(out: &mut Paper, index: usize, edge: &Edge) -> fmt::Result {
     write!(
         out,
         "<tr><th scope=\"row\"><a href=\"#edge-{index}\">{}</a></th><td>{}</td>",
         Escaped(&edge.id),
-        State(edge.verdict)
+        out.state(edge.verdict)
     )?;
     for quantity in [Quantity::D1, Quantity::D2, Quantity::AngleDeviation] {
         let found = edge.characteristics.iter().find(|c| c.quantity == quantity);
         match found {
             Some(characteristic) => write_figure_cell(out, characteristic)?,
-            None => out.write_str("<td class=\"n soft\">not measured</td>")?,
+            None => out.put("<td class=\"n soft\">[[not.measured]]</td>")?,
         }
     }
     let share = edge.coverage.clamp(0.0, 1.0);
@@ -229,17 +236,16 @@ fn write_row(out: &mut String, index: usize, edge: &Edge) -> fmt::Result {
          <rect class=\"got\" width=\"{:.1}\" height=\"10\"/></svg></td><td class=\"n\">{}</td><td>{}</td><td class=\"n\">#{}</td></tr>",
         percent(share),
         100.0 * share,
-        edge.length_mm
-            .map_or_else(|| "–".to_owned(), |length| format!("{length:.1}")),
-        kind(edge),
+        length(out, edge),
+        kind(out, edge),
         edge.nominal_entity
     )
 }
 
-fn write_figure_cell(out: &mut String, characteristic: &Characteristic) -> fmt::Result {
+fn write_figure_cell(out: &mut Paper, characteristic: &Characteristic) -> fmt::Result {
     match characteristic.value {
         Some(value) => {
-            let figure = Figure::of(characteristic.quantity, value, characteristic.u);
+            let figure = out.figure(characteristic.quantity, value, characteristic.u);
             let bad = if characteristic.verdict == Status::NotOk {
                 " bad"
             } else {
@@ -247,7 +253,7 @@ fn write_figure_cell(out: &mut String, characteristic: &Characteristic) -> fmt::
             };
             write!(out, "<td class=\"n{bad}\">{}</td>", PlusMinus(&figure))
         }
-        None => out.write_str("<td class=\"n soft\">not measured</td>"),
+        None => out.put("<td class=\"n soft\">[[not.measured]]</td>"),
     }
 }
 
@@ -260,68 +266,82 @@ pub(super) fn percent(share: f64) -> String {
     }
 }
 
-pub(super) fn kind(edge: &Edge) -> &'static str {
-    match edge.kind {
+fn kind(out: &Paper, edge: &Edge) -> String {
+    out.t(match edge.kind {
         Kind::Convex => "convex",
         Kind::Concave => "concave",
-    }
+    })
 }
 
-fn write_view(out: &mut String, drawing: &Drawing<'_>) -> fmt::Result {
-    out.write_str("<section class=\"card\"><h2>Where</h2>\n<div class=\"view\" id=\"view\">\n")?;
+fn length(out: &Paper, edge: &Edge) -> String {
+    edge.length_mm
+        .map_or_else(|| "–".to_owned(), |length| out.number(length, 1))
+}
+
+fn write_view(out: &mut Paper, drawing: &Drawing<'_>) -> fmt::Result {
+    out.put("<section class=\"card\"><h2>[[where]]</h2>\n<div class=\"view\" id=\"view\">\n")?;
     drawing.write_svg(out)?;
+    let factor = out.words.number(&drawing.factor.to_string());
     writeln!(
         out,
-        "</div>\n<p class=\"small soft\" id=\"view-factor\">Hair lines show the deviations × {}.</p>\n\
-         <div class=\"tools live\" id=\"view-tools\" hidden>\
-         <button type=\"button\" data-view=\"home\">Home</button><button type=\"button\" data-view=\"front\">Front</button>\
-         <button type=\"button\" data-view=\"side\">Side</button><button type=\"button\" data-view=\"top\">Top</button>\
-         <button type=\"button\" data-zoom=\"1.25\" aria-label=\"Zoom in\">+</button><button type=\"button\" data-zoom=\"0.8\" aria-label=\"Zoom out\">−</button>\
-         <label>deviations <input type=\"range\" id=\"view-scale\" min=\"0\" step=\"1\"> <output id=\"view-scale-shown\"></output></label></div>\n\
-         <p class=\"readout live\" id=\"view-readout\" role=\"status\"></p>",
-        drawing.factor
+        "</div>\n<p class=\"small soft\" id=\"view-factor\">{}</p>",
+        Escaped(&out.with("hairs", &[("factor", &factor)]))
+    )?;
+    out.put(
+        "<div class=\"tools live\" id=\"view-tools\" hidden>\
+         <button type=\"button\" data-view=\"home\">[[view.home]]</button><button type=\"button\" data-view=\"front\">[[view.front]]</button>\
+         <button type=\"button\" data-view=\"side\">[[view.side]]</button><button type=\"button\" data-view=\"top\">[[view.top]]</button>\
+         <button type=\"button\" data-zoom=\"1.25\" aria-label=\"[[view.in]]\">+</button><button type=\"button\" data-zoom=\"0.8\" aria-label=\"[[view.out]]\">−</button>\
+         <label>[[view.deviations]] <input type=\"range\" id=\"view-scale\" min=\"0\" step=\"1\"> <output id=\"view-scale-shown\"></output></label></div>\n\
+         <p class=\"readout live\" id=\"view-readout\" role=\"status\"></p>\n",
     )?;
     out.write_str("<ul class=\"legend drawing-legend\">")?;
     for (state, name) in [
-        ("run s-ok", "OK"),
-        ("run s-not_ok", "NOT OK: thick"),
-        ("run s-not_decidable", "NOT DECIDABLE: dashed"),
-        ("run s-undefined", "not judged"),
-        ("run s-gap", "not measured: dotted"),
-        ("hair", "deviation, enlarged"),
-        ("extra", "not in the nominal: red, dotted"),
+        ("run s-ok", "legend.ok"),
+        ("run s-not_ok", "legend.not_ok"),
+        ("run s-not_decidable", "legend.not_decidable"),
+        ("run s-undefined", "legend.undefined"),
+        ("run s-gap", "legend.gap"),
+        ("hair", "legend.hair"),
+        ("extra", "legend.extra"),
     ] {
         write!(
             out,
-            "<li><svg class=\"drawing\" viewBox=\"0 0 44 12\" aria-hidden=\"true\"><path class=\"{state}\" d=\"M3 6H41\"/></svg>{name}</li>"
+            "<li><svg class=\"drawing\" viewBox=\"0 0 44 12\" aria-hidden=\"true\"><path class=\"{state}\" d=\"M3 6H41\"/></svg>{}</li>",
+            Escaped(&out.t(name))
         )?;
     }
     out.write_str("</ul></section>\n")
 }
 
 /// `, 40 % boundary (one flank seen)`; nothing where both were seen.
-fn boundary(edge: &Edge) -> String {
+fn boundary(out: &Paper, edge: &Edge) -> String {
     match edge.boundary_share {
-        Some(share) if share > 0.0 => format!(", {} boundary (one flank seen)", percent(share)),
+        Some(share) if share > 0.0 => out.with("boundary", &[("share", &percent(share))]),
         _ => String::new(),
     }
 }
 
-fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::Result {
-    out.write_str("<section class=\"card\"><h2>Each edge</h2>\n<p class=\"small soft\">Line: deviation. Band around it: ± U. \
-         Tinted stripe: within the limits; dashed lines: the limits, value at the right. Hatched: not measured. Diamond: the worst place.</p>\n")?;
+fn write_edges(out: &mut Paper, report: &Report, shown: &[Vec<usize>]) -> fmt::Result {
+    out.put(
+        "<section class=\"card\"><h2>[[each]]</h2>\n<p class=\"small soft\">[[each.note]]</p>\n",
+    )?;
     for (index, (edge, shown)) in report.edges.iter().zip(shown).enumerate() {
         writeln!(
             out,
-            "<section class=\"edge\" id=\"edge-{index}\"><h3>{} {} <span class=\"soft small\">{}, {} mm, {} measured{}, STEP #{}</span></h3>",
+            "<section class=\"edge\" id=\"edge-{index}\"><h3>{} {} <span class=\"soft small\">{}</span></h3>",
             Escaped(&edge.id),
-            State(edge.verdict),
-            kind(edge),
-            edge.length_mm
-                .map_or_else(|| "–".to_owned(), |length| format!("{length:.1}")),
-            percent(edge.coverage),
-            boundary(edge),
-            edge.nominal_entity
+            out.state(edge.verdict),
+            Escaped(&out.with(
+                "edge.head",
+                &[
+                    ("kind", &kind(out, edge)),
+                    ("length", &length(out, edge)),
+                    ("share", &percent(edge.coverage)),
+                    ("boundary", &boundary(out, edge)),
+                    ("entity", &edge.nominal_entity.to_string()),
+                ],
+            ))
         )?;
         write_reasons(out, edge)?;
         out.write_str("<div class=\"plots\">")?;
@@ -333,11 +353,11 @@ fn write_edges(out: &mut String, report: &Report, shown: &[Vec<usize>]) -> fmt::
         out.write_str("</div>")?;
         values::write_edge(out, edge)?;
         if shown.len() < edge.stations.len() {
+            let (drawn, all) = (shown.len().to_string(), edge.stations.len().to_string());
             write!(
                 out,
-                "<p class=\"small soft\">{} of {} stations are drawn; the CSV and JSON forms hold all.</p>",
-                shown.len(),
-                edge.stations.len()
+                "<p class=\"small soft\">{}</p>",
+                Escaped(&out.with("drawn", &[("shown", &drawn), ("all", &all)]))
             )?;
         }
         out.write_str("</section>\n")?;
@@ -353,7 +373,7 @@ fn angle_matters(edge: &Edge) -> bool {
 }
 
 /// Where along the edge something was not measured or not decidable, and why.
-fn write_reasons(out: &mut String, edge: &Edge) -> fmt::Result {
+fn write_reasons(out: &mut Paper, edge: &Edge) -> fmt::Result {
     const SHOWN: usize = 6;
     let mut runs: Vec<(f64, f64, &str)> = Vec::new();
     let mut open = false;
@@ -371,24 +391,39 @@ fn write_reasons(out: &mut String, edge: &Edge) -> fmt::Result {
     }
     out.write_str("<ul class=\"small\">")?;
     for (from, to, reason) in runs.iter().take(SHOWN) {
+        let ends = [out.number(*from, 1), out.number(*to, 1)];
         let place = if from == to {
-            format!("{from:.1} mm")
+            format!("{} mm", ends[0])
         } else {
-            format!("{from:.1} to {to:.1} mm")
+            out.with("from.to.mm", &[("from", &ends[0]), ("to", &ends[1])])
         };
-        write!(out, "<li>{place}: {}</li>", Escaped(reason))?;
+        write!(
+            out,
+            "<li>{place}: {}</li>",
+            Escaped(&out.words.said(reason))
+        )?;
     }
     if runs.len() > SHOWN {
-        write!(out, "<li>and {} more stretches</li>", runs.len() - SHOWN)?;
+        let more = (runs.len() - SHOWN).to_string();
+        write!(
+            out,
+            "<li>{}</li>",
+            Escaped(&out.with("stretches", &[("count", &more)]))
+        )?;
     }
     out.write_str("</ul>\n")
 }
 
-fn write_footer(out: &mut String, report: &Report) -> fmt::Result {
+fn write_footer(out: &mut Paper, report: &Report) -> fmt::Result {
     writeln!(
         out,
-        "<footer class=\"small soft\"><p>Made by {} {}. This page is complete in itself: it loads nothing from anywhere.</p></footer>",
-        Escaped(&report.software.name),
-        Escaped(&report.software.version)
+        "<footer class=\"small soft\"><p>{}</p></footer>",
+        Escaped(&out.with(
+            "footer",
+            &[
+                ("name", &report.software.name),
+                ("version", &report.software.version)
+            ],
+        ))
     )
 }

@@ -13,6 +13,11 @@ use super::problem::{Place, Problem};
 #[folder = "src/web/page"]
 struct Page;
 
+/// The table of texts, which the report has too.
+#[derive(Embed)]
+#[folder = "src/words"]
+struct Words;
+
 /// The page.
 pub(super) async fn page(State(_): State<App>, headers: HeaderMap) -> Response {
     match Page::get("index.html") {
@@ -23,7 +28,11 @@ pub(super) async fn page(State(_): State<App>, headers: HeaderMap) -> Response {
 
 /// One of its files.
 pub(super) async fn file(Place(path): Place<String>, headers: HeaderMap) -> Response {
-    match Page::get(&path) {
+    let found = match path.as_str() {
+        "texts.json" => Words::get(&path),
+        _ => Page::get(&path),
+    };
+    match found {
         Some(file) => answer(&headers, &path, file),
         None => Problem::missing("the page has no such file").into_response(),
     }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use acies::report::{Report, print_table};
+use acies::words::Language;
 use proptest::prelude::*;
 
 use super::part;
@@ -51,12 +52,65 @@ fn csv_is_one_row_a_station() {
 
 #[test]
 fn the_page_says_what_the_operator_needs() {
-    insta::assert_snapshot!("page", text_of(&super::report().to_html()));
+    insta::assert_snapshot!("page", text_of(&super::report().to_html(Language::En)));
+}
+
+#[test]
+fn the_page_is_german_where_that_is_asked_for() {
+    let german = text_of(&super::report().to_html(Language::De));
+    insta::assert_snapshot!("page_de", german);
+    let texts = include_str!("../../src/words/texts.json");
+    let texts: serde_json::Value = serde_json::from_str(texts).expect("the table");
+    let words = |text: &str| {
+        let words = text.split_whitespace();
+        words
+            .filter(|word| word.chars().any(char::is_alphabetic))
+            .count()
+    };
+    let mut looked = 0;
+    for (key, english) in texts["en"].as_object().expect("texts by key") {
+        let english = english.as_str().expect("a text");
+        if texts["de"][key] == english {
+            continue;
+        }
+        // Between the places to fill: three words or more are no chance.
+        for part in english
+            .split(['{', '}'])
+            .step_by(2)
+            .filter(|part| words(part) >= 3)
+        {
+            looked += 1;
+            assert!(
+                !german.contains(part.trim()),
+                "{key}: {part:?} in the German page"
+            );
+        }
+    }
+    assert!(looked > 300, "{looked} texts");
+}
+
+#[test]
+fn numbers_of_the_german_page_have_a_decimal_comma() {
+    let german = text_of(&super::report().to_html(Language::De));
+    let point = |line: &&str| {
+        let bytes = line.as_bytes();
+        (1..bytes.len().saturating_sub(1)).any(|at| {
+            bytes[at] == b'.' && bytes[at - 1].is_ascii_digit() && bytes[at + 1].is_ascii_digit()
+        })
+    };
+    // Versions of firmware and of the program are names.
+    let names = ["Erstellt von", "Acies"];
+    let left: Vec<&str> = german
+        .lines()
+        .filter(point)
+        .filter(|line| !names.iter().any(|name| line.contains(name)))
+        .collect();
+    assert_eq!(left, Vec::<&str>::new());
 }
 
 #[test]
 fn the_page_asks_the_network_for_nothing() {
-    let page = super::report().to_html();
+    let page = super::report().to_html(Language::En);
     for reference in [
         "http:", "https:", "src=", "@import", "url(http", "<link", "<iframe",
     ] {
@@ -101,7 +155,7 @@ fn each_verdict_has_its_own_reason_and_advice() {
     inspection.edges.retain(|edge| edge.id != "e3");
     let gap = said(&Report::new(&inspection, &facts));
     assert!(
-        gap.contains("of the edge was measured (no points on flank 2"),
+        gap.contains("of the edge was measured (no points on either flank"),
         "{gap}"
     );
     assert!(gap.contains("scan the missing stretches again"), "{gap}");
@@ -154,7 +208,10 @@ fn a_report_without_edges_still_has_every_form() {
     inspection.edges.clear();
     inspection.verdict = acies::inspect::result::Verdict::Undefined;
     let report = Report::new(&inspection, &part::facts());
-    assert!(text_of(&report.to_html()).contains("The nominal has no sharp edge to measure."));
+    assert!(
+        text_of(&report.to_html(Language::En))
+            .contains("The nominal has no sharp edge to measure.")
+    );
     assert_eq!(parse_csv(&report.to_csv()).len(), 1);
     let told = "not judged: the nominal has no sharp edge to measure; check that the right nominal was given
 ";
@@ -171,11 +228,13 @@ fn the_ending_decides_the_form_and_the_file_is_whole() {
     let report = super::report();
     for (name, text) in [
         ("r.json", report.to_json()),
-        ("r.HTML", report.to_html()),
+        ("r.HTML", report.to_html(Language::En)),
         ("r.csv", report.to_csv()),
     ] {
         let path = folder.join(name);
-        report.write_atomically(&path).expect("it can be written");
+        report
+            .write_atomically(&path, Language::En)
+            .expect("it can be written");
         assert_eq!(std::fs::read_to_string(&path).expect("it is there"), text);
     }
     let left = std::fs::read_dir(&folder).expect("it is a folder").count();
@@ -187,7 +246,7 @@ fn a_report_that_cannot_be_written_says_why() {
     let report = super::report();
     let error = |path: &str| {
         report
-            .write_atomically(Path::new(path))
+            .write_atomically(Path::new(path), Language::En)
             .expect_err("it cannot be written")
             .to_string()
     };
@@ -250,8 +309,8 @@ proptest! {
     #[test]
     fn no_text_changes_the_structure_of_the_page(text in hostile()) {
         let report = report_saying(&text);
-        let page = report.to_html();
-        prop_assert_eq!(tags(&page), tags(&report_saying("x").to_html()));
+        let page = report.to_html(Language::En);
+        prop_assert_eq!(tags(&page), tags(&report_saying("x").to_html(Language::En)));
         let (_, rest) = page.split_once("id=\"view-data\">").expect("the data of the view");
         let (data, _) = rest.split_once("</script>").expect("it ends");
         let data: serde_json::Value = serde_json::from_str(data).expect("it is JSON");
@@ -300,7 +359,7 @@ proptest! {
             let said = &hit.stations[station].reason;
             prop_assert!(said.contains("is not a number below 1e9"), "{said}");
         }
-        for form in [report.to_html(), report.to_csv(), print_table(&report, false)] {
+        for form in [report.to_html(Language::En), report.to_csv(), print_table(&report, false)] {
             // `Infinity` and `NaN` are no words of ours; the script has neither.
             prop_assert!(!form.contains("NaN") && !form.contains("inf,") && !form.contains("inf "));
             prop_assert!(form.len() < 200_000, "no number of 300 digits");

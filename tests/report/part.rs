@@ -145,7 +145,7 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
             boundary: None,
             points: [14, 0],
             verdict: Verdict::NotDecidable,
-            reason: "no points on flank 2 within 3 mm of the edge".to_owned(),
+            reason: "no points on either flank".to_owned(),
         };
     }
     let u_mm = [0.004 + 0.002 * (5.0 * t).sin().abs(), 0.005];
@@ -190,7 +190,7 @@ fn station(shape: &Shape, t: f64, seed: &mut u64) -> StationResult {
         points: [184, 172],
         verdict,
         reason: if verdict == Verdict::NotDecidable {
-            "a limit lies inside the uncertainty zone".to_owned()
+            "a limit of d1 lies inside its uncertainty".to_owned()
         } else {
             String::new()
         },
@@ -288,10 +288,12 @@ pub fn inspection(stations: usize) -> Inspection {
             .max()
             .unwrap_or(Verdict::Undefined),
         edges,
-        seconds: vec![("align", 0.41), ("detect", 0.93), ("measure", 0.22)],
-        findings: vec![
-            "213 points lie more than 2 mm from every face and were not used".to_owned(),
+        seconds: vec![
+            ("alignment", 0.41),
+            ("edges", 0.22),
+            ("comparison of edges found", 0.93),
         ],
+        findings: vec!["213 of 412480 points were not finite and were left out".to_owned()],
         scan: None,
     };
     judge_again(&mut inspection, &facts().recipe);

@@ -33,6 +33,11 @@ fn an_inspection_is_found_with_its_report_in_every_form_and_its_scan() {
         page.text()
             .contains("href=\"/api/v1/inspections/1/report.csv\"")
     );
+    let german = cell.get(&format!("{base}/report.html?language=de"));
+    assert!(german.text().contains("<html lang=\"de\">"));
+    assert!(german.text().contains("NICHT OK"));
+    let unknown = cell.get(&format!("{base}/report.html?language=xx"));
+    assert_eq!(unknown.status, 400);
     let csv = cell.get(&format!("{base}/report.csv"));
     assert_eq!(csv.header("content-type"), "text/csv; charset=utf-8");
     assert!(

@@ -8,6 +8,7 @@ use std::time::{Duration, SystemTime};
 
 use acies::store::Role;
 use acies::web;
+use acies::words::Language;
 use headless_chrome::protocol::cdp::{Emulation, Page};
 use headless_chrome::{Browser, LaunchOptions, Tab};
 
@@ -236,8 +237,36 @@ fn a_part_is_started_by_keyboard_watched_judged_and_found_again_also_after_a_res
     page.until("document.querySelector('#verdict')?.textContent === 'NICHT OK'");
     page.until("document.querySelector('#reason').textContent.includes('außerhalb der Grenzen')");
     page.until("document.querySelector('#result').textContent.includes('Teil beiseitelegen')");
+    told_alike(&page);
+    page.go("history");
+    page.click("#list tbody a");
+    page.until("document.querySelector('#report')?.contentDocument?.documentElement.lang === 'de'");
+    page.until("document.querySelector('#report').contentDocument.body.textContent.includes('Messunsicherheit')");
+    page.go("measure");
+    page.until("document.querySelector('#verdict')?.textContent === 'NICHT OK'");
     page.value("document.querySelector('#language').click()");
     shots(&browser, &cell, &page);
+}
+
+/// The page and the program tell the same sentence in the same words.
+fn told_alike(page: &Seen) {
+    let english = [
+        "flank 1 (face #12): no points; flank 2 (face #7): 3 points, 8 needed",
+        "points only 0.120 to 0.480 mm from the edge, too short a reach to extrapolate",
+        "a limit of the edge radius lies inside its uncertainty; a limit of d1 lies inside its uncertainty",
+        "alignment: the data do not hold along x, rotation about (0.10, 0.20, 0.97), which moves edge e1; scan another face",
+        "the cell is not ready: device \"left\": /dev/ttyUSB0: no such file; look at the cable",
+        "not begun: halted by no points; Ada",
+        "said by nobody: 1.5; of us",
+        "",
+    ];
+    page.value(&format!(
+        "(import('/page/text.js').then((text) => {{ window.told = JSON.stringify({}.map(text.said)); }}), 1)",
+        serde_json::to_string(&english).expect("texts")
+    ));
+    page.until("window.told");
+    let told: Vec<String> = serde_json::from_str(&page.value("told")).expect("texts");
+    assert_eq!(told, english.map(|sentence| Language::De.said(sentence)));
 }
 
 #[test]

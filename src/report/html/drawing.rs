@@ -5,9 +5,8 @@ use std::fmt::{self, Write};
 use glam::{DVec2, DVec3};
 use serde_json::{Value, json};
 
-use super::page::{Escaped, class};
+use super::page::{Escaped, Paper, class, word};
 use super::plot::nice_step;
-use crate::report::figure::Figure;
 use crate::report::wire::{Edge, Quantity, Report, Station, Status, Xyz};
 
 const WIDTH: f64 = 720.0;
@@ -17,6 +16,19 @@ const MARGIN: f64 = 34.0;
 /// The eye stands in front of the part (towards -y), turned to its +x side and raised.
 const YAW_RAD: f64 = 0.55;
 const PITCH_RAD: f64 = 0.5;
+
+/// What the script says.
+const TOLD: [&str; 9] = [
+    "view.keys",
+    "view.point",
+    "view.at",
+    "view.values",
+    "view.ok",
+    "view.not_ok",
+    "view.not_decidable",
+    "view.undefined",
+    "view.gap",
+];
 
 /// Longest hair as a share of the size of the part: longer ones hide the edges, shorter ones are not seen.
 const HAIR_SHARE: f64 = 0.06;
@@ -83,11 +95,11 @@ impl<'a> Drawing<'a> {
     }
 
     /// Writes the SVG.
-    pub fn write_svg(&self, out: &mut String) -> fmt::Result {
+    pub fn write_svg(&self, out: &mut Paper) -> fmt::Result {
         writeln!(
             out,
             r#"<svg class="drawing" id="drawing" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{}">"#,
-            Escaped(&self.spoken())
+            Escaped(&self.spoken(out))
         )?;
         let at = self.paper();
         let mut order: Vec<_> = self.lines.iter().collect();
@@ -138,20 +150,17 @@ impl<'a> Drawing<'a> {
         move |p| DVec2::new(WIDTH, HEIGHT) / 2.0 + (project(p - centre) - middle) * scale
     }
 
-    fn spoken(&self) -> String {
+    fn spoken(&self, out: &Paper) -> String {
         let states: Vec<_> = self
             .lines
             .iter()
-            .map(|line| format!("{} {}", line.edge.id, super::page::word(line.edge.verdict)))
+            .map(|line| format!("{} {}", line.edge.id, word(out.words, line.edge.verdict)))
             .collect();
-        format!(
-            "The sharp edges of the part, seen from its front right: {}.",
-            states.join(", ")
-        )
+        out.with("seen", &[("edges", &states.join(", "))])
     }
 
     /// What the script draws from: as [`Drawing::write_svg`], in mm.
-    pub fn data(&self) -> Value {
+    pub fn data(&self, out: &Paper) -> Value {
         let round = |v: f64, unit: f64| (v / unit).round() * unit;
         let text = |v: DVec3, unit: f64| {
             let short = |v: f64| {
@@ -174,7 +183,7 @@ impl<'a> Drawing<'a> {
                     "first": line.first,
                     "xyz": line.points.iter().map(|p| text(*p, 1e-3)).collect::<Vec<_>>(),
                     "off": line.stations.iter().map(|s| offset(s).map(|v| text(v, 1e-4))).collect::<Vec<_>>(),
-                    "say": line.stations.iter().map(|s| say(s)).collect::<Vec<_>>(),
+                    "say": line.stations.iter().map(|s| say(out, s)).collect::<Vec<_>>(),
                     "runs": line.runs,
                 })
             })
@@ -183,7 +192,12 @@ impl<'a> Drawing<'a> {
             .map(|i| nice_step(self.factor / 10.0 * 10f64.powf(f64::from(i) / 3.0) * 0.8))
             .chain([self.factor])
             .collect();
+        let told = TOLD.iter().map(|key| {
+            let name = key.strip_prefix("view.").unwrap_or(key);
+            (name.to_owned(), Value::from(out.t(key)))
+        });
         json!({
+            "words": told.collect::<serde_json::Map<_, _>>(),
             "yaw": YAW_RAD, "pitch": PITCH_RAD,
             "centre": self.centre.to_array(), "radius": self.radius_mm,
             "factor": self.factor, "factors": sorted(factors), "edges": edges,
@@ -220,11 +234,11 @@ fn sorted(mut values: Vec<f64>) -> Vec<f64> {
 }
 
 /// Arc length, and where measured d1 and d2 with their U, as people read them.
-fn say(station: &Station) -> Vec<String> {
-    let mut words = vec![format!("{:.1}", station.s_mm)];
+fn say(out: &Paper, station: &Station) -> Vec<String> {
+    let mut words = vec![out.number(station.s_mm, 1)];
     if let (Some(d1), Some(d2)) = (station.d1_mm, station.d2_mm) {
-        words.push(Figure::of(Quantity::D1, d1, station.u_d1_mm).plus_minus());
-        words.push(Figure::of(Quantity::D2, d2, station.u_d2_mm).plus_minus());
+        words.push(out.figure(Quantity::D1, d1, station.u_d1_mm).plus_minus());
+        words.push(out.figure(Quantity::D2, d2, station.u_d2_mm).plus_minus());
     }
     words
 }
@@ -332,7 +346,7 @@ fn depth(line: &Line<'_>) -> f64 {
     PITCH_RAD.cos() * away - PITCH_RAD.sin() * middle.z
 }
 
-fn write_path(out: &mut String, points: impl Iterator<Item = DVec2>) -> fmt::Result {
+fn write_path(out: &mut Paper, points: impl Iterator<Item = DVec2>) -> fmt::Result {
     for (index, p) in points.enumerate() {
         let pen = if index == 0 { 'M' } else { 'L' };
         write!(out, "{pen}{:.1} {:.1}", p.x, p.y)?;
@@ -341,7 +355,7 @@ fn write_path(out: &mut String, points: impl Iterator<Item = DVec2>) -> fmt::Res
 }
 
 fn write_hairs(
-    out: &mut String,
+    out: &mut Paper,
     line: &Line<'_>,
     factor: f64,
     at: &impl Fn(DVec3) -> DVec2,
@@ -363,7 +377,7 @@ fn write_hairs(
     out.write_str("\"/>\n")
 }
 
-fn write_axes(out: &mut String) -> fmt::Result {
+fn write_axes(out: &mut Paper) -> fmt::Result {
     let origin = DVec2::new(38.0, HEIGHT - 38.0);
     for (name, axis) in [("x", DVec3::X), ("y", DVec3::Y), ("z", DVec3::Z)] {
         let (tip, text) = (origin + 26.0 * project(axis), origin + 35.0 * project(axis));

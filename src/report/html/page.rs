@@ -1,9 +1,65 @@
-//! What every part of the page uses: escaping, words and signs of a verdict, figures with their uncertainty.
+//! What every part of the page uses: its paper with its language, escaping, words and signs of a verdict, figures.
 
 use std::fmt;
 
+use crate::report::because::code;
 use crate::report::figure::Figure;
-use crate::report::wire::Status;
+use crate::report::wire::{Quantity, Status};
+use crate::words::Language;
+
+/// The page as it is written, in one language.
+pub struct Paper {
+    /// What is written so far.
+    pub text: String,
+    /// The language.
+    pub words: Language,
+}
+
+impl fmt::Write for Paper {
+    fn write_str(&mut self, text: &str) -> fmt::Result {
+        self.text.push_str(text);
+        Ok(())
+    }
+}
+
+impl Paper {
+    /// Writes markup of ours in which `[[key]]` stands for the text `report.key`.
+    pub fn put(&mut self, markup: &'static str) -> fmt::Result {
+        use fmt::Write as _;
+        let mut rest = markup;
+        while let Some((before, after)) = rest.split_once("[[") {
+            let (key, after) = after.split_once("]]").unwrap_or((after, ""));
+            write!(self, "{before}{}", Escaped(&self.t(key)))?;
+            rest = after;
+        }
+        self.write_str(rest)
+    }
+
+    /// The text `report.key`.
+    pub fn t(&self, key: &str) -> String {
+        self.with(key, &[])
+    }
+
+    /// The same with its {names} filled in.
+    pub fn with(&self, key: &str, values: &[(&str, &str)]) -> String {
+        self.words.fill(&format!("report.{key}"), values)
+    }
+
+    /// A number with so many digits behind the decimal sign.
+    pub fn number(&self, value: f64, digits: usize) -> String {
+        self.words.number(&format!("{value:.digits$}"))
+    }
+
+    /// A value with its uncertainty as the language writes it.
+    pub fn figure(&self, quantity: Quantity, value: f64, u: Option<f64>) -> Figure {
+        Figure::of(quantity, value, u).told(self.words)
+    }
+
+    /// Sign and word of a verdict.
+    pub fn state(&self, status: Status) -> State {
+        State(status, self.words)
+    }
+}
 
 /// Text from outside, made safe for HTML text and quoted attributes; control characters become spaces.
 pub struct Escaped<'a>(pub &'a str);
@@ -27,13 +83,8 @@ impl fmt::Display for Escaped<'_> {
 }
 
 /// The word for a verdict.
-pub fn word(status: Status) -> &'static str {
-    match status {
-        Status::Ok => "OK",
-        Status::NotOk => "NOT OK",
-        Status::NotDecidable => "NOT DECIDABLE",
-        Status::Undefined => "NOT JUDGED",
-    }
+pub fn word(words: Language, status: Status) -> String {
+    words.fill(&format!("verdict.report.{}", code(&status)), &[])
 }
 
 /// The name of a verdict in class names and in the data of the 3D view.
@@ -47,11 +98,11 @@ pub fn class(status: Status) -> &'static str {
 }
 
 /// Sign and word of a verdict, so that colour is never alone.
-pub struct State(pub Status);
+pub struct State(Status, Language);
 
 impl fmt::Display for State {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (class, word) = (class(self.0), word(self.0));
+        let (class, word) = (class(self.0), word(self.1, self.0));
         write!(
             f,
             r##"<span class="state c-{class}"><svg aria-hidden="true" viewBox="0 0 24 24"><use href="#i-{class}"/></svg>{word}</span>"##

@@ -2,11 +2,11 @@
 
 use std::fmt::{self, Write};
 
-use super::page::class;
+use super::page::{Escaped, Paper, class};
 use crate::inspect::quantity::Unit;
 use crate::report::characteristic::sample;
-use crate::report::figure::{COVERAGE_FACTOR, Figure};
-use crate::report::wire::{Characteristic, Edge, Quantity, Status};
+use crate::report::figure::COVERAGE_FACTOR;
+use crate::report::wire::{Characteristic, Edge, Judged, Quantity, Status};
 
 const WIDTH: f64 = 480.0;
 const HEIGHT: f64 = 190.0;
@@ -48,7 +48,7 @@ impl Axes {
 }
 
 /// Writes the plot of one quantity; `shown` are the stations to draw.
-pub fn write(out: &mut String, edge: &Edge, quantity: Quantity, shown: &[usize]) -> fmt::Result {
+pub fn write(out: &mut Paper, edge: &Edge, quantity: Quantity, shown: &[usize]) -> fmt::Result {
     let Some(characteristic) = edge.characteristics.iter().find(|c| c.quantity == quantity) else {
         return Ok(());
     };
@@ -61,7 +61,7 @@ pub fn write(out: &mut String, edge: &Edge, quantity: Quantity, shown: &[usize])
     writeln!(
         out,
         r#"<figure><svg class="plot" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{}">"#,
-        super::page::Escaped(&spoken(edge, characteristic))
+        Escaped(&spoken(out, edge, characteristic))
     )?;
     write_within(out, &axes, characteristic)?;
     write_grid(out, &axes)?;
@@ -71,16 +71,18 @@ pub fn write(out: &mut String, edge: &Edge, quantity: Quantity, shown: &[usize])
     write_line(out, &axes, &dots)?;
     write_worst(out, &axes, characteristic)?;
     let caption = match quantity {
-        Quantity::D1 => "d1, µm, along n1",
-        Quantity::D2 => "d2, µm, along n2",
-        Quantity::AngleDeviation => "included angle minus nominal, °",
-        other => other.words(),
+        Quantity::D1 => out.t("plot.d1"),
+        Quantity::D2 => out.t("plot.d2"),
+        Quantity::AngleDeviation => out.t("plot.angle"),
+        other => out.words.said(other.words()),
     };
     writeln!(
         out,
-        r#"<text class="x" x="{:.0}" y="{:.0}">arc length, mm</text></svg><figcaption>{caption}</figcaption></figure>"#,
+        r#"<text class="x" x="{:.0}" y="{:.0}">{}</text></svg><figcaption>{}</figcaption></figure>"#,
         (WIDTH + LEFT - RIGHT) / 2.0,
-        HEIGHT - 3.0
+        HEIGHT - 3.0,
+        Escaped(&out.t("plot.s")),
+        Escaped(&caption)
     )
 }
 
@@ -123,18 +125,21 @@ fn axes(edge: &Edge, (dots, scale): (&[Dot], f64), characteristic: &Characterist
     }
 }
 
-fn spoken(edge: &Edge, characteristic: &Characteristic) -> String {
-    format!(
-        "Deviation along edge {}: worst, {}. {} of {} stations measured.",
-        edge.id,
-        crate::report::wire::Judged::from(characteristic).stated(&characteristic.reason),
-        edge.summary.measured,
-        edge.summary.stations
+fn spoken(out: &Paper, edge: &Edge, characteristic: &Characteristic) -> String {
+    let judged = Judged::from(characteristic);
+    out.with(
+        "plot.said",
+        &[
+            ("edge", &edge.id),
+            ("said", &judged.stated(&characteristic.reason, out.words)),
+            ("measured", &edge.summary.measured.to_string()),
+            ("stations", &edge.summary.stations.to_string()),
+        ],
     )
 }
 
 /// The stripe within the limits.
-fn write_within(out: &mut String, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
+fn write_within(out: &mut Paper, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
     let (Some(lower), Some(upper)) = (characteristic.lower, characteristic.upper) else {
         return Ok(());
     };
@@ -147,7 +152,7 @@ fn write_within(out: &mut String, axes: &Axes, characteristic: &Characteristic) 
 }
 
 /// A dashed line a limit, its value at the right.
-fn write_limits(out: &mut String, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
+fn write_limits(out: &mut Paper, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
     let x1 = WIDTH - RIGHT;
     for limit in [characteristic.upper, characteristic.lower]
         .into_iter()
@@ -161,14 +166,14 @@ fn write_limits(out: &mut String, axes: &Axes, characteristic: &Characteristic) 
                 r#"<path class="limit" d="M{LEFT:.1} {y:.1}H{x1:.1}"/><text class="limit-name" x="{:.1}" y="{:.1}">{}</text>"#,
                 x1 + 5.0,
                 y + 4.0,
-                Figure::of(characteristic.quantity, limit, None).value
+                out.figure(characteristic.quantity, limit, None).value
             )?;
         }
     }
     Ok(())
 }
 
-fn write_grid(out: &mut String, axes: &Axes) -> fmt::Result {
+fn write_grid(out: &mut Paper, axes: &Axes) -> fmt::Result {
     let (x0, x1) = (axes.x(0.0), axes.x(axes.length_mm));
     let step = nice_step((axes.high - axes.low) / 4.0);
     let first = (axes.low / step).ceil() as i64;
@@ -176,7 +181,7 @@ fn write_grid(out: &mut String, axes: &Axes) -> fmt::Result {
     for tick in first..=last {
         let y = axes.y(tick as f64 * step);
         let class = if tick == 0 { "zero" } else { "grid" };
-        let label = tick_label(tick as f64 * step, step);
+        let label = out.words.number(&tick_label(tick as f64 * step, step));
         writeln!(
             out,
             r#"<path class="{class}" d="M{x0:.1} {y:.1}H{x1:.1}"/><text class="y" x="{:.1}" y="{:.1}">{label}</text>"#,
@@ -191,7 +196,8 @@ fn write_grid(out: &mut String, axes: &Axes) -> fmt::Result {
             out,
             r#"<path class="grid" d="M{x:.1} {base:.1}v4"/><text class="x" x="{x:.1}" y="{:.1}">{}</text>"#,
             base + 16.0,
-            tick_label(mm, step).trim_start_matches('+'),
+            out.words
+                .number(tick_label(mm, step).trim_start_matches('+')),
             x = axes.x(mm)
         )?;
     }
@@ -221,7 +227,7 @@ fn tick_label(value: f64, step: f64) -> String {
 }
 
 /// Hatches from the last measured station before a hole to the first behind it.
-fn write_holes(out: &mut String, axes: &Axes, dots: &[Dot]) -> fmt::Result {
+fn write_holes(out: &mut Paper, axes: &Axes, dots: &[Dot]) -> fmt::Result {
     let mut from_mm = Some(0.0);
     let mut hole = false;
     let ends = dots
@@ -237,16 +243,18 @@ fn write_holes(out: &mut String, axes: &Axes, dots: &[Dot]) -> fmt::Result {
             let (x0, x1) = (axes.x(from_mm), axes.x(s_mm));
             writeln!(
                 out,
-                r#"<rect class="hole" x="{x0:.1}" y="{TOP:.1}" width="{:.1}" height="{:.1}"><title>not measured</title></rect>"#,
+                r#"<rect class="hole" x="{x0:.1}" y="{TOP:.1}" width="{:.1}" height="{:.1}"><title>{}</title></rect>"#,
                 x1 - x0,
-                HEIGHT - TOP - BOTTOM
+                HEIGHT - TOP - BOTTOM,
+                Escaped(&out.t("not.measured"))
             )?;
             if x1 - x0 > 76.0 {
                 writeln!(
                     out,
-                    r#"<text class="x worst-name" x="{:.1}" y="{:.1}">not measured</text>"#,
+                    r#"<text class="x worst-name" x="{:.1}" y="{:.1}">{}</text>"#,
                     (x0 + x1) / 2.0,
-                    TOP + 0.72 * (HEIGHT - TOP - BOTTOM)
+                    TOP + 0.72 * (HEIGHT - TOP - BOTTOM),
+                    Escaped(&out.t("not.measured"))
                 )?;
             }
         }
@@ -267,7 +275,7 @@ fn runs(dots: &[Dot]) -> impl Iterator<Item = Vec<(f64, f64, f64)>> {
         .filter(|run| !run.is_empty())
 }
 
-fn write_band(out: &mut String, axes: &Axes, dots: &[Dot]) -> fmt::Result {
+fn write_band(out: &mut Paper, axes: &Axes, dots: &[Dot]) -> fmt::Result {
     for run in runs(dots) {
         out.write_str(r#"<path class="u" d=""#)?;
         let above = run.iter().map(|&(s, d, u)| (s, d + u));
@@ -281,7 +289,7 @@ fn write_band(out: &mut String, axes: &Axes, dots: &[Dot]) -> fmt::Result {
     Ok(())
 }
 
-fn write_line(out: &mut String, axes: &Axes, dots: &[Dot]) -> fmt::Result {
+fn write_line(out: &mut Paper, axes: &Axes, dots: &[Dot]) -> fmt::Result {
     for run in runs(dots) {
         if let [(s_mm, um, _)] = run[..] {
             writeln!(
@@ -302,13 +310,14 @@ fn write_line(out: &mut String, axes: &Axes, dots: &[Dot]) -> fmt::Result {
     Ok(())
 }
 
-fn write_worst(out: &mut String, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
+fn write_worst(out: &mut Paper, axes: &Axes, characteristic: &Characteristic) -> fmt::Result {
     let (Some(value), Some(s_mm)) = (characteristic.value, characteristic.s_mm) else {
         return writeln!(
             out,
-            r#"<text class="x" x="{:.0}" y="{:.0}">not measured</text>"#,
+            r#"<text class="x" x="{:.0}" y="{:.0}">{}</text>"#,
             WIDTH / 2.0,
-            HEIGHT / 2.0
+            HEIGHT / 2.0,
+            Escaped(&out.t("not.measured"))
         );
     };
     let (x, y) = (axes.x(s_mm), axes.y(value * axes.scale));
@@ -316,7 +325,7 @@ fn write_worst(out: &mut String, axes: &Axes, characteristic: &Characteristic) -
         Status::Undefined => "undefined",
         verdict => class(verdict),
     };
-    let figure = Figure::of(characteristic.quantity, value, characteristic.u);
+    let figure = out.figure(characteristic.quantity, value, characteristic.u);
     let below = y < TOP + 26.0 || (value < 0.0 && y < HEIGHT - BOTTOM - 24.0);
     let name_y = if below { y + 20.0 } else { y - 10.0 };
     let anchor = match x {

@@ -10,7 +10,7 @@
   canvas.tabIndex = 0;
   canvas.setAttribute('role', 'img');
   canvas.setAttribute('aria-label', drawing.getAttribute('aria-label') +
-    ' Arrow keys turn the view, plus and minus zoom, zero resets.');
+    ' ' + data.words.keys);
   canvas.className = 'live';
   box.prepend(canvas);
   drawing.setAttribute('hidden', '');
@@ -26,7 +26,8 @@
   const VIEWS = { home: HOME, front: { yaw: 0, pitch: 0, zoom: 1 }, side: { yaw: Math.PI / 2, pitch: 0, zoom: 1 },
     top: { yaw: 0, pitch: Math.PI / 2, zoom: 1 } };
   let eye = { ...HOME }, factor = data.factor, picked = null;
-  const words = { ok: 'OK', not_ok: 'NOT OK', not_decidable: 'not decidable', undefined: 'not judged', gap: 'not measured' };
+  const words = data.words;
+  const filled = (text, values) => text.replace(/\{(\w+)\}/g, (_, name) => values[name]);
   const looks = { ok: [2.4, []], not_ok: [4.6, []], not_decidable: [3.2, [7, 5]], undefined: [2.4, []], gap: [2, [1, 5]] };
   const colour = name => getComputedStyle(document.documentElement).getPropertyValue('--' + name).trim();
 
@@ -129,11 +130,11 @@
       if (gap < best) { best = gap; found = { edge, i, xyz }; }
     }));
     picked = found;
-    if (!found) { readout.textContent = 'Point at an edge to read it.'; return; }
+    if (!found) { readout.textContent = words.point; return; }
     const said = found.edge.say[found.i];
     const run = found.edge.runs.find(r => found.i + found.edge.first >= r[1] && found.i + found.edge.first < r[2]) || found.edge.runs.at(-1);
-    readout.textContent = found.edge.id + ' at ' + said[0] + ' mm: ' +
-      (said.length > 1 ? 'd1 ' + said[1] + ' µm, d2 ' + said[2] + ' µm, ' : '') + words[run[0]];
+    readout.textContent = filled(words.at, { edge: found.edge.id, s: said[0] }) +
+      (said.length > 1 ? filled(words.values, { d1: said[1], d2: said[2] }) : '') + words[run[0]];
   }
 
   let held = null;
@@ -172,6 +173,6 @@
   slider.addEventListener('input', () => { factor = steps[slider.value]; draw(); });
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', draw);
   new ResizeObserver(draw).observe(canvas);
-  readout.textContent = 'Point at an edge to read it.';
+  readout.textContent = words.point;
   draw();
 })();

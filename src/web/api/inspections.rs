@@ -22,6 +22,7 @@ use crate::store::{Export, History, Inspection, Order, ScanFileError, ScanReader
 use crate::web::access::Who;
 use crate::web::app::{App, blocking};
 use crate::web::problem::{Asked, Input, Place, Problem, chain};
+use crate::words::Language;
 
 /// Longest serial or order number; a data-matrix code holds at most 2335 characters, parts' codes far fewer.
 const NAME_MAX: usize = 200;
@@ -153,13 +154,24 @@ pub async fn report_json(
     Ok(bytes("application/json", json).into_response())
 }
 
+/// How a report is shown.
+#[derive(Debug, Deserialize, IntoParams)]
+#[into_params(parameter_in = Query)]
+pub struct Shown {
+    /// Language of the page; English where none is said. What devices and people said stays as it is.
+    #[param(inline)]
+    language: Option<Language>,
+}
+
 /// The report as a page of its own.
-#[utoipa::path(get, path = "/api/v1/inspections/{id}/report.html", tag = "inspections", params(("id" = i64, Path)),
+#[utoipa::path(get, path = "/api/v1/inspections/{id}/report.html", tag = "inspections", params(("id" = i64, Path), Shown),
     responses((status = 200, description = "the page", content_type = "text/html", body = String)))]
 pub async fn report_html(
     State(app): State<App>,
     Place(id): Place<i64>,
+    Asked(shown): Asked<Shown>,
 ) -> Result<Response, Problem> {
+    let words = shown.language.unwrap_or_default();
     let page = app.store(move |store| {
         let has_scan = store.scan_path(id).is_ok();
         Ok((store.report_json(id)?, has_scan))
@@ -167,18 +179,19 @@ pub async fn report_html(
     let (json, has_scan) = page.await?;
     let html = blocking(move || {
         let base = format!("/api/v1/inspections/{id}");
+        let scan_ply = words.text("report.scan.ply").to_owned();
         let mut links = vec![
             (format!("{base}/report.json"), "JSON"),
             (format!("{base}/report.csv"), "CSV"),
         ];
         if has_scan {
-            links.push((format!("{base}/scan.ply"), "scan as PLY"));
+            links.push((format!("{base}/scan.ply"), scan_ply.as_str()));
         }
         let links: Vec<(&str, &str)> = links
             .iter()
             .map(|(to, name)| (to.as_str(), *name))
             .collect();
-        read(&json).map(|report| report.to_html_with_links(&links))
+        read(&json).map(|report| report.to_html_with_links(words, &links))
     });
     let mut answer = bytes("text/html; charset=utf-8", html.await??).into_response();
     // Shown inside our own page, and nowhere else.

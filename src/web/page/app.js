@@ -2,7 +2,7 @@
 
 import { follow, get, post, Problem } from "./api.js";
 import { fill, h, say } from "./dom.js";
-import { loadTexts, switchLanguage, t, word } from "./text.js";
+import { loadTexts, said, switchLanguage, t, word } from "./text.js";
 import { audit } from "./views/audit.js";
 import { devices } from "./views/devices.js";
 import { history } from "./views/history.js";
@@ -105,9 +105,9 @@ function listen() {
 /** Shows an error in words: what was seen, and what to do. */
 function fail(error) {
   const details = error instanceof Problem ? error.details : { title: t("lost"), detail: "", what_to_do: "" };
-  return dialog(details.title, [
-    h("p", { id: "problem" }, details.detail ?? ""),
-    details.what_to_do ? h("p.note", {}, details.what_to_do) : null,
+  return dialog(said(details.title), [
+    h("p", { id: "problem" }, said(details.detail)),
+    details.what_to_do ? h("p.note", {}, said(details.what_to_do)) : null,
   ]);
 }
 
@@ -131,7 +131,7 @@ function dialog(title, content, { yes = null, send = null } = {}) {
         } catch (error) {
           wrong.hidden = false;
           const details = error.details ?? { detail: t("lost") };
-          say(wrong, [details.detail ?? details.title, details.what_to_do].filter(Boolean).join(". "));
+          say(wrong, [details.detail ?? details.title, details.what_to_do].filter(Boolean).map(said).join(". "));
         }
       },
     }, h("h2", {}, title), content, wrong, h("div.row", {},

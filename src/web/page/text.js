@@ -1,4 +1,4 @@
-// The two languages, and numbers and times as they are written in each.
+// The two languages, sentences of the program, and numbers and times as they are written in each.
 
 let texts = {};
 let language = "en";
@@ -24,6 +24,9 @@ export function switchLanguage() {
   try { localStorage.setItem("language", language); } catch { /* then it holds until the page is closed */ }
 }
 
+/** The language of the page, as the API knows it. */
+export const spoken = () => language;
+
 /** The text of `key`, with {names} filled in. */
 export function t(key, values = {}) {
   const text = texts[language]?.[key] ?? key;
@@ -34,6 +37,82 @@ export function t(key, values = {}) {
 export function word(kind, value) {
   const key = `${kind}.${value}`;
   return texts[language]?.[key] ?? String(value ?? "");
+}
+
+/** What stands between sentences that were joined. */
+const SEPARATORS = /; |: |, /g;
+/** Longer than any sentence of the program: what is longer came from outside. */
+const LONGEST = 2_000;
+const NUMBER = "[-+−]?\\d+(?:\\.\\d+)?";
+
+let sentences = null;
+
+/** The rows `said.*` as patterns of their English; the row that says most of itself is the one that was meant. */
+function known(text) {
+  sentences ??= Object.entries(texts.en).filter(([key]) => key.startsWith("said.")).map(([key, english]) => {
+    const parts = english.split(/\{([\w.]+)\}/);
+    const pattern = parts.map((part, index) => {
+      if (index % 2) return part.startsWith("number.") ? `(${NUMBER})` : "(.+?)";
+      return part.replace(/[.*+?^${}()|[\]\\]/g, "\\$&");
+    });
+    const own = parts.filter((_, index) => index % 2 === 0).join("").length;
+    return { key, names: parts.filter((_, index) => index % 2), pattern: new RegExp(`^${pattern.join("")}$`, "s"), own };
+  }).sort((a, b) => b.own - a.own || (a.key < b.key ? -1 : 1));
+  for (const sentence of sentences) {
+    const values = sentence.pattern.exec(text)?.slice(1);
+    if (values) return { sentence, values };
+  }
+  return null;
+}
+
+function retold({ sentence, values }) {
+  return texts[language][sentence.key].replace(/\{([\w.]+)\}/g, (_, name) => {
+    const value = values[sentence.names.indexOf(name)] ?? "";
+    if (name.startsWith("said.")) return told(value) ?? value;
+    return name.startsWith("number.") ? value.replace(".", t("decimal")) : value;
+  });
+}
+
+/** Two sentences or more with semicolons between them, all of them known. */
+function joined(text) {
+  const found = [];
+  let rest = text;
+  for (let at = rest.indexOf("; "); at >= 0; at = rest.indexOf("; ", at + 1)) {
+    const front = known(rest.slice(0, at));
+    if (!front) continue;
+    found.push(front);
+    rest = rest.slice(at + 2);
+    at = -1;
+  }
+  const last = found.length ? known(rest) : null;
+  return last ? [...found, last].map(retold).join("; ") : null;
+}
+
+/** Of a text of which only parts are known: first where its front is, then where only its rest is. */
+function pieces(text) {
+  const cuts = [...text.matchAll(SEPARATORS)].map((cut) => [text.slice(0, cut.index), cut[0], text.slice(cut.index + 2)]);
+  for (const [front, between, rest] of cuts) {
+    const found = known(front);
+    if (found) return retold(found) + between + (told(rest) ?? rest);
+  }
+  if (!cuts.length) return null;
+  const [front, between, rest] = cuts[0];
+  const end = told(rest);
+  return end === null ? null : front + between + end;
+}
+
+/** Nothing where nothing of it is known. */
+function told(text) {
+  const all = joined(text);
+  if (all) return all;
+  const one = known(text);
+  return one ? retold(one) : pieces(text);
+}
+
+/** What the program says in English, in the page's language; what is not the program's (a device's error, a name) stays as it is. */
+export function said(english) {
+  if (language === "en" || !english || english.length > LONGEST) return english ?? "";
+  return told(english) ?? english;
 }
 
 /** A number with so many digits behind the point. */

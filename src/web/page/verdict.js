@@ -1,7 +1,7 @@
 // A verdict as a sign, a word and a colour: never the colour alone.
 
 import { h } from "./dom.js";
-import { number, signed, t, word } from "./text.js";
+import { number, said, signed, t, word } from "./text.js";
 
 export const SIGNS = { ok: "✓", not_ok: "✕", not_decidable: "?", undefined: "–", refused: "!", aborted: "!" };
 
@@ -50,32 +50,35 @@ export function valued(found) {
   return `${signed(found.value, places)}${spread}${unit}`;
 }
 
-/** Why a verdict is what it is, in the page's language; `found` is an inspection or a report. What an older version wrote stays English. */
+/** Why a verdict is what it is, in the page's language; `found` is an inspection or a report. */
 export function because(found) {
   const why = found.because;
-  if (!why) return found.reason;
+  if (!why) return said(found.reason);
   const judged = why.characteristic;
   const values = {
     edge: why.edge,
-    names: listed(why.names),
+    names: listed(why.names.map(said)),
     count: why.count,
     share: Math.round((why.coverage ?? 0) * 100),
-    detail: why.detail ? t("because.detail", { detail: why.detail }) : "",
+    detail: why.detail ? t("because.detail", { detail: said(why.detail) }) : "",
     others: why.count === 0 ? "" : t(why.count === 1 ? "because.other" : "because.others", { count: why.count }),
   };
   if (judged) {
     const place = judged.s_mm === null ? "" : t("because.place", { s: number(judged.s_mm, 1) });
-    values.said = judged.value === null
-      ? t("because.unmeasured", { quantity: word("quantity", judged.quantity) })
-      : t("because.stated", { quantity: word("quantity", judged.quantity), value: valued(judged), place });
-    values.limits = limits(judged);
+    const quantity = word("quantity", judged.quantity);
+    if (judged.value !== null) values.said = t("because.stated", { quantity, value: valued(judged), place });
+    else if (why.detail) values.said = t("because.valueless", { quantity, detail: said(why.detail) });
+    else values.said = t("because.unmeasured", { quantity });
+    const between = limits(judged);
+    values.limits = between === "–" ? "" : t("because.limits", { limits: between });
   }
   return t(`because.${why.code}`, values);
 }
 
 /** What to do next, in the page's language. */
 export function advised(found) {
-  return found.because ? t(`advised.${found.because.advice}`) : found.advice;
+  const advice = found.because ? t(`advised.${found.because.advice}`) : said(found.advice);
+  return advice ? `${advice[0].toUpperCase()}${advice.slice(1)}.` : "";
 }
 
 /** At most five of them, then a count. */

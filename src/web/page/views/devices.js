@@ -2,7 +2,7 @@
 
 import { get, post } from "../api.js";
 import { fill, h } from "../dom.js";
-import { bytes, count, number, t, time, word } from "../text.js";
+import { bytes, count, number, said, t, time, word } from "../text.js";
 
 const SIGNS = { ready: "✓", busy: "…", connecting: "…", failed: "✕" };
 
@@ -39,7 +39,7 @@ export function devices(view, page) {
         h("div", {}, h("h2", {}, device.name), h("p.note", {}, word("kind", device.kind)),
           h("span.badge", { "data-verdict": device.state }, h("span", { "aria-hidden": "true" }, SIGNS[device.state]), " ", word("device", device.state))),
         h("div", {},
-          device.error ? h("p.bad", {}, device.error) : null,
+          device.error ? h("p.bad", {}, said(device.error)) : null,
           h("dl.facts", {}, [
             ["identity", device.identity ?? "–"], ["since", time(device.since)], ["opened", count(device.opened)], ["failures", count(device.failures)],
             ["received", count(device.received)], ["lost", device.received ? `${count(device.lost)} (${number(100 * device.lost / (device.received + device.lost), 2)} %)` : count(device.lost)],
@@ -48,8 +48,8 @@ export function devices(view, page) {
     }));
     const storage = snapshot.storage;
     fill(health, [
-      ["state", `${word("state", snapshot.state)} (${snapshot.state_number})`], ["cause", snapshot.cause || "–"], ["version", snapshot.version], ["started", time(snapshot.started)],
-      ["recipe", snapshot.recipe ? `${snapshot.recipe.name} v${snapshot.recipe.version}` : "–"], ["recipe_problem", snapshot.recipe_problem || "–"],
+      ["state", `${word("state", snapshot.state)} (${snapshot.state_number})`], ["cause", said(snapshot.cause) || "–"], ["version", snapshot.version], ["started", time(snapshot.started)],
+      ["recipe", snapshot.recipe ? `${snapshot.recipe.name} v${snapshot.recipe.version}` : "–"], ["recipe_problem", said(snapshot.recipe_problem) || "–"],
       ["inspections", count(storage?.inspections)], ["scans", storage ? `${count(storage.scans)}, ${bytes(storage.scan_bytes)}` : "–"], ["database", bytes(storage?.database_bytes)], ["free", bytes(storage?.free_bytes)],
     ].map(fact));
   }

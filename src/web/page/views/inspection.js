@@ -2,7 +2,7 @@
 
 import { get } from "../api.js";
 import { fill, h, table } from "../dom.js";
-import { bytes, count, number, t, time, word } from "../text.js";
+import { bytes, count, number, said, spoken, t, time, word } from "../text.js";
 import { advised, badge, because, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
 
 export function inspection(view, page, [id]) {
@@ -38,19 +38,19 @@ export function inspection(view, page, [id]) {
         h("p.part", {}, `#${found.id} · ${found.part_serial}`), h("p.reason", { id: "reason" }, because(found))),
       h("section.card", {},
         h("dl.facts", {}, facts.map(([name, fact]) => h("div", {}, h("dt", {}, t(`fact.${name}`)), h("dd", {}, fact)))),
-        h("div.row", {}, done ? [link("report.json", "JSON"), link("report.csv", "CSV"), link("report.html", "HTML")] : null,
+        h("div.row", {}, done ? [link("report.json", "JSON"), link("report.csv", "CSV"), link(`report.html?language=${spoken()}`, "HTML")] : null,
           found.scan_bytes === null ? null : [link("scan.ply", "PLY"), link("scan.raw", t("raw.file"))])));
     if (!done) return;
-    const frame = h("iframe", { src: `${base}/report.html`, title: t("report.frame"), id: "report" });
+    const frame = h("iframe", { src: `${base}/report.html?language=${spoken()}`, title: t("report.frame"), id: "report" });
     const worst = h("section.card", {});
     view.append(worst, h("section.card", {}, h("h2", {}, t("report.frame")), frame));
     const report = await get(`/inspections/${found.id}/report.json`);
     const judged = worstFirst(report);
-    const rows = judged.slice(0, 40).map((one) => ({ cells: [badge(one.verdict), one.edge, word("quantity", one.quantity), valued(one), limits(one), one.reason] }));
+    const rows = judged.slice(0, 40).map((one) => ({ cells: [badge(one.verdict), one.edge, word("quantity", one.quantity), valued(one), limits(one), said(one.reason)] }));
     fill(worst, h("h2", {}, t("worst.first")), report.advice ? h("p", {}, advised(report)) : null,
       table(["verdict", "edge", "quantity", "value", "limits", "reason"].map((name) => t(`column.${name}`)), rows, [3, 4]),
       judged.length > 40 ? h("p.note", {}, t("more.in.report", { count: judged.length - 40 })) : null,
-      report.findings.length ? [h("h3", {}, t("findings")), h("ul", {}, report.findings.map((finding) => h("li", {}, finding)))] : null);
+      report.findings.length ? [h("h3", {}, t("findings")), h("ul", {}, report.findings.map((finding) => h("li", {}, said(finding))))] : null);
   }
 
   load();

@@ -3,7 +3,7 @@
 import { get, post, start } from "../api.js";
 import { fill, h, say } from "../dom.js";
 import { livePictures } from "../live.js";
-import { t, time, word } from "../text.js";
+import { said, t, time, word } from "../text.js";
 import { advised, badge, because, limits, outcome, SIGNS, valued, worstFirst } from "../verdict.js";
 
 /** Lines of the short table; the whole one is a click away. */
@@ -57,7 +57,7 @@ export function measure(view, page) {
     } catch (error) {
       wrong.hidden = false;
       const details = error.details ?? { detail: t("lost") };
-      say(wrong, [details.detail, details.what_to_do].filter(Boolean).join(". "));
+      say(wrong, [details.detail, details.what_to_do].filter(Boolean).map(said).join(". "));
       serial.select();
     } finally {
       go.disabled = !page.snapshot?.accepts;
@@ -90,7 +90,7 @@ export function measure(view, page) {
       say(sign, "⋯");
       say(big, word("step.big", job.step));
       say(part, job.part_serial);
-      say(reason, job.findings.at(-1) ?? "");
+      say(reason, said(job.findings.at(-1)));
       say(advice, "");
       if (job.step === "inspecting") bar.removeAttribute("value");
       else bar.value = job.step === "touching" && job.touches ? job.touches[0] / job.touches[1] : job.share;
@@ -100,8 +100,8 @@ export function measure(view, page) {
       say(sign, snapshot.state === "preoperational" ? "⋯" : "!");
       say(big, word("state", snapshot.state));
       say(part, "");
-      say(reason, snapshot.cause);
-      say(advice, snapshot.advice);
+      say(reason, said(snapshot.cause));
+      say(advice, said(snapshot.advice));
     } else if (snapshot.last) {
       showLast(snapshot.last);
     } else {

@@ -2,7 +2,7 @@
 
 import { get, post, query } from "../api.js";
 import { fill, h, say, table } from "../dom.js";
-import { t, time } from "../text.js";
+import { said, t, time } from "../text.js";
 
 export function recipes(view, page, [id]) {
   const list = h("section.card", { id: "list" });
@@ -49,7 +49,7 @@ export function recipes(view, page, [id]) {
         const result = await post("/recipes/check", { text: text.value, nominal_of: number });
         fill(found, result.ok
           ? h("p", {}, h("span.badge", { "data-verdict": "ok" }, "✓ ", t("check.ok", { edges: result.sharp_edges })))
-          : h("pre", {}, result.mistakes.join("\n")));
+          : h("pre", {}, result.mistakes.map(said).join("\n")));
       } catch (error) {
         await page.fail(error);
       }
