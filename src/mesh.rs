@@ -11,6 +11,7 @@ pub mod check;
 mod cone;
 mod curve;
 mod cut;
+mod defect;
 pub mod delaunay;
 pub mod mend;
 pub mod normals;

@@ -7,9 +7,9 @@
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
 
-use super::delaunay::Delaunay;
-use super::mend::{Ring, defect};
-use super::star::{Facets, Stars};
+use super::defect::change_of_right;
+use super::delaunay::{Delaunay, GHOST};
+use super::star::Facets;
 
 /// A cell on the surface, and the radius of the widest of its facets there.
 #[derive(PartialEq)]
@@ -31,26 +31,28 @@ impl PartialOrd for Exposed {
 
 struct Carver<'a> {
     delaunay: &'a Delaunay,
-    stars: &'a Stars,
     inside: Vec<bool>,
-    ring: Ring,
+    /// Which vertices are on the surface of the body, not within it.
+    is_reached: Vec<bool>,
 }
 
 /// Which cells are inside the body nearest to the `wish`; ghosts are outside in both.
 ///
 /// Vertices that the surface does not reach stay within; through holes and voids stay closed by a layer of cells.
-pub(super) fn carve(
-    delaunay: &Delaunay,
-    stars: &Stars,
-    facets: &Facets,
-    wish: &[bool],
-) -> Vec<bool> {
+pub(super) fn carve(delaunay: &Delaunay, facets: &Facets, wish: &[bool]) -> Vec<bool> {
     let cells = 0..wish.len() as u32;
+    let mut is_reached = vec![false; delaunay.points.len()];
+    let hull = delaunay
+        .cells
+        .iter()
+        .filter(|c| c.contains(&GHOST))
+        .flatten();
+    hull.filter(|v| **v != GHOST)
+        .for_each(|v| is_reached[*v as usize] = true);
     let mut carver = Carver {
         delaunay,
-        stars,
         inside: cells.map(|c| !delaunay.is_ghost(c)).collect(),
-        ring: Ring::default(),
+        is_reached,
     };
     carver.take_off(facets, wish);
     carver.inside
@@ -95,18 +97,21 @@ impl Carver<'_> {
         radii.max_by(f32::total_cmp).map(|r| Exposed(r, cell))
     }
 
-    /// Takes a cell off where that makes no vertex wrong that was right; whether it did.
+    /// Takes a cell off where that makes no vertex wrong that was right or within; whether it did.
     fn try_without(&mut self, cell: u32) -> bool {
-        self.inside[cell as usize] = false;
         let corners = self.delaunay.cells[cell as usize];
-        let is_right = corners.iter().all(|v| self.is_right_or_within(*v));
-        self.inside[cell as usize] = !is_right;
-        is_right
-    }
-
-    fn is_right_or_within(&mut self, v: u32) -> bool {
-        let star = self.stars.of(v);
-        star.iter().all(|code| self.inside[(code >> 2) as usize])
-            || defect(self.delaunay, self.stars, &self.inside, v, &mut self.ring) == 0
+        // A first cell off a vertex within leaves inside and outside one piece each.
+        let stays_right = |v: &u32| {
+            !self.is_reached[*v as usize]
+                || change_of_right(self.delaunay, &self.inside, *v, cell) == 0
+        };
+        let may_go = corners.iter().all(stays_right);
+        if may_go {
+            self.inside[cell as usize] = false;
+            corners
+                .iter()
+                .for_each(|v| self.is_reached[*v as usize] = true);
+        }
+        may_go
     }
 }

@@ -7,8 +7,8 @@
 
 use glam::DVec3;
 
+use super::defect::{Ring, change_of_right, defect};
 use super::delaunay::{Delaunay, GHOST};
-use super::mend::{Ring, defect};
 use super::star::Stars;
 
 /// Rounds over all cells; later ones change next to nothing.
@@ -132,17 +132,25 @@ impl Work<'_> {
         self.flip(cells);
         let after = self.bends();
         let gains = after.is_some_and(|after| before - after > LEAST_GAIN * before);
-        if gains && self.are_right() {
-            // Vertices that were wrong before stay as they are.
+        self.flip(cells);
+        // Vertices that were wrong before stay as they are.
+        let may_turn = gains && self.are_right() && self.stay_right(cells);
+        if may_turn {
             self.flip(cells);
-            let were_right = self.are_right();
-            if were_right {
-                self.flip(cells);
-            }
-            return were_right;
+        }
+        may_turn
+    }
+
+    /// Whether vertices that are right are so after cells are turned.
+    fn stay_right(&mut self, cells: &[u32]) -> bool {
+        if let [cell] = cells {
+            let mut corners = self.corners.iter();
+            return corners.all(|v| change_of_right(self.delaunay, self.inside, *v, *cell) == 0);
         }
         self.flip(cells);
-        false
+        let are_right = self.are_right();
+        self.flip(cells);
+        are_right
     }
 
     fn flip(&mut self, cells: &[u32]) {
