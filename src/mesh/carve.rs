@@ -36,11 +36,11 @@ struct Carver<'a> {
     is_reached: Vec<bool>,
 }
 
-/// Which cells are inside the body nearest to the `wish`; ghosts are outside in both.
+/// Which cells are inside the body nearest to the `wish`, or, without one, the body under the narrowest facets; ghosts are outside in all.
 ///
 /// Vertices that the surface does not reach stay within; through holes and voids stay closed by a layer of cells.
-pub(super) fn carve(delaunay: &Delaunay, facets: &Facets, wish: &[bool]) -> Vec<bool> {
-    let cells = 0..wish.len() as u32;
+pub(super) fn carve(delaunay: &Delaunay, facets: &Facets, wish: Option<&[bool]>) -> Vec<bool> {
+    let cells = 0..delaunay.cells.len() as u32;
     let mut is_reached = vec![false; delaunay.points.len()];
     let hull = delaunay
         .cells
@@ -54,18 +54,22 @@ pub(super) fn carve(delaunay: &Delaunay, facets: &Facets, wish: &[bool]) -> Vec<
         inside: cells.map(|c| !delaunay.is_ghost(c)).collect(),
         is_reached,
     };
-    carver.take_off(facets, wish);
+    carver.take_off(
+        facets,
+        |c| wish.is_none_or(|wish| !wish[c as usize]),
+        wish.is_none(),
+    );
     carver.inside
 }
 
 impl Carver<'_> {
     /// Cells one by one, those under the widest facets first.
-    fn take_off(&mut self, facets: &Facets, wish: &[bool]) {
+    fn take_off(&mut self, facets: &Facets, is_unwanted: impl Fn(u32) -> bool, by_width: bool) {
         /// A cell that could not be taken off is tried again when others have gone; seldom more than twice.
         const ROUNDS: usize = 8;
         let cells = 0..self.inside.len() as u32;
         let mut waiting: Vec<u32> = cells
-            .filter(|c| self.inside[*c as usize] && !wish[*c as usize])
+            .filter(|c| self.inside[*c as usize] && is_unwanted(*c))
             .collect();
         for _ in 0..ROUNDS {
             let mut heap: BinaryHeap<Exposed> = (waiting.iter())
@@ -73,9 +77,11 @@ impl Carver<'_> {
                 .collect();
             let before = waiting.len();
             while let Some(Exposed(_, cell)) = heap.pop() {
-                if self.inside[cell as usize] && self.try_without(cell) {
+                let may_go =
+                    self.inside[cell as usize] && (!by_width || self.narrows(facets, cell));
+                if may_go && self.try_without(cell) {
                     for n in self.delaunay.neighbors[cell as usize] {
-                        if self.inside[n as usize] && !wish[n as usize] {
+                        if self.inside[n as usize] && is_unwanted(n) {
                             heap.extend(self.exposed(facets, n));
                         }
                     }
@@ -95,6 +101,19 @@ impl Carver<'_> {
             .filter(|at| !self.inside[beside[*at] as usize])
             .map(|at| facets.radius(cell, at));
         radii.max_by(f32::total_cmp).map(|r| Exposed(r, cell))
+    }
+
+    /// Whether the surface reaches a vertex more, or becomes narrower, without a cell.
+    fn narrows(&self, facets: &Facets, cell: u32) -> bool {
+        let beside = self.delaunay.neighbors[cell as usize];
+        let widest = |side: bool| {
+            let radii = (0..4)
+                .filter(|at| self.inside[beside[*at] as usize] == side)
+                .map(|at| facets.radius(cell, at));
+            radii.fold(0.0, f32::max)
+        };
+        let corners = self.delaunay.cells[cell as usize];
+        corners.iter().any(|v| !self.is_reached[*v as usize]) || widest(false) > widest(true)
     }
 
     /// Takes a cell off where that makes no vertex wrong that was right or within; whether it did.

@@ -55,24 +55,37 @@ pub fn mend(
     if first.after == 0 && NO_BODY * before <= delaunay.points.len() {
         return first;
     }
-    let mut other = solid.clone();
-    other.inside = carve(delaunay, facets, &wish);
-    let found = defects(delaunay, stars, &other.inside);
-    let second = Mending {
-        before,
-        ..search(all, &mut other, found, Some(&wish))
-    };
-    let rank = |mending: &Mending, inside: &[bool]| {
-        let t = topology(delaunay.points.len(), &surface(delaunay, inside));
-        // Pieces and handles together.
-        (mending.after, 2 * t.pieces as i64 - t.euler / 2)
-    };
-    if rank(&second, &other.inside) < rank(&first, &solid.inside) {
-        *solid = other;
-        second
-    } else {
-        first
+    let mut best = (rank(delaunay, first, &solid.inside), first);
+    for wish_of_carving in [Some(&*wish), None] {
+        let mut other = solid.clone();
+        other.inside = carve(delaunay, facets, wish_of_carving);
+        let found = defects(delaunay, stars, &other.inside);
+        let mending = Mending {
+            before,
+            ..search(all, &mut other, found, Some(&wish))
+        };
+        let own = rank(delaunay, mending, &other.inside);
+        if own < best.0 {
+            *solid = other;
+            best = (own, mending);
+        }
     }
+    best.1
+}
+
+/// What is compared of two bodies through the same points: wrong vertices, then pieces and handles together, then the area of the surface.
+fn rank(delaunay: &Delaunay, mending: Mending, inside: &[bool]) -> (usize, i64, f64) {
+    let triangles = surface(delaunay, inside);
+    let t = topology(delaunay.points.len(), &triangles);
+    let twice = triangles.iter().map(|t| {
+        let [a, b, c] = t.map(|v| delaunay.points[v as usize]);
+        (b - a).cross(c - a).length()
+    });
+    (
+        mending.after,
+        2 * t.pieces as i64 - t.euler / 2,
+        twice.sum(),
+    )
 }
 
 /// For every vertex its defect.
