@@ -43,11 +43,22 @@ pub fn sharpen(delaunay: &Delaunay, stars: &Stars, inside: &mut [bool]) -> usize
             if !turned && work.is_sharp_at(cell) {
                 let side = work.inside[cell as usize];
                 let beside = delaunay.neighbors[cell as usize];
-                turned = beside.into_iter().any(|n| {
-                    !delaunay.is_ghost(n)
-                        && work.inside[n as usize] == side
-                        && work.try_turning(&[cell, n])
-                });
+                let may_follow =
+                    |w: &Work, n: u32| !delaunay.is_ghost(n) && w.inside[n as usize] == side;
+                turned = beside
+                    .into_iter()
+                    .any(|n| may_follow(&work, n) && work.try_turning(&[cell, n]));
+                turned = turned
+                    || beside.into_iter().any(|n| {
+                        may_follow(&work, n)
+                            && (beside.into_iter().filter(|m| *m > n))
+                                .chain(
+                                    delaunay.neighbors[n as usize]
+                                        .into_iter()
+                                        .filter(|m| *m != cell),
+                                )
+                                .any(|m| may_follow(&work, m) && work.try_turning(&[cell, n, m]))
+                    });
             }
             if turned {
                 changed += 1;
@@ -110,6 +121,9 @@ impl Work<'_> {
 
     /// Turns cells if that leaves all vertices right and the bends less.
     fn try_turning(&mut self, cells: &[u32]) -> bool {
+        if !self.keeps_count(cells) {
+            return false;
+        }
         self.edges.clear();
         self.corners.clear();
         for &cell in cells {
@@ -139,6 +153,20 @@ impl Work<'_> {
             self.flip(cells);
         }
         may_turn
+    }
+
+    /// Whether the surface has as many triangles after cells, all on one side, are turned: through the same vertices another number is another
+    /// number of pieces or handles.
+    fn keeps_count(&self, cells: &[u32]) -> bool {
+        let beside = cells
+            .iter()
+            .flat_map(|c| self.delaunay.neighbors[*c as usize]);
+        let is_across = |n: u32| self.inside[n as usize] != self.inside[cells[0] as usize];
+        let sum: i32 = beside
+            .filter(|n| !cells.contains(n))
+            .map(|n| if is_across(n) { -1 } else { 1 })
+            .sum();
+        sum == 0
     }
 
     /// Whether vertices that are right are so after cells are turned.
