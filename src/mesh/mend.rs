@@ -38,7 +38,8 @@ pub fn mend(
     solid: &mut Solid,
     is_wanted: bool,
 ) -> Mending {
-    /// Where more than one vertex in so many is wrong, umbrellas made no body to begin with.
+    /// Where more than one vertex in so many is wrong, umbrellas made no body to begin with. Measured over tables 5.2 and the peers of the bench and
+    /// 21 thin plates: at 5 one plate more falls apart; at 100 the noisiest body with a hole is lost, since carving knows fewer holes.
     const NO_BODY: usize = 20;
     let found = defects(delaunay, stars, &solid.inside);
     let before = found.iter().filter(|d| **d > 0).count();
@@ -184,6 +185,7 @@ struct Look {
 }
 
 /// Cells around a vertex above which it is a hub, as rows of points in one plane make them: looked at one by one they cost the square of their number.
+/// Measured on the bench and 21 thin plates: 64, 1,024 and no such limit give the same meshes.
 const HUB: usize = 256;
 /// Wrong vertices whose cells are looked at for one turn.
 const LOOKED_AT: usize = 3;
@@ -406,7 +408,7 @@ impl Search<'_> {
     /// Joins islands, closed pieces of a few vertices beside the others, to what lies nearest: a row of cells is turned, and what has to follow. Kept
     /// is what makes one piece of two without a handle.
     fn join_islands(&mut self) -> usize {
-        /// Vertices of the largest island; more are a body, or a void, of its own.
+        /// Vertices of the largest island; more are a body, or a void, of its own. Measured like [`HUB`]: 20 and 500 give the same meshes.
         const ISLAND: usize = 100;
         const MOST: usize = 1_000;
         let triangles = super::solid::surface(self.delaunay, &self.solid.inside);

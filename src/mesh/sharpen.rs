@@ -1,7 +1,7 @@
 //! Edges of the mesh laid along the sharp edges of the part.
 //!
 //! We differ: the cone of the thesis works only while umbrellas are matched, and takes part only where they do not match at once (Ma 2011,
-//! §5.4.3). Afterwards cells are turned, one or two neighbours at a time, where that gathers the bends of the surface on fewer and shorter
+//! §5.4.3). Afterwards cells are turned, up to three neighbours at a time, where that gathers the bends of the surface on fewer and shorter
 //! edges: one cell that fills the four corners of two triangles exchanges their diagonal. The mesh stays made of Delaunay facets: it cannot
 //! cross itself.
 
@@ -15,7 +15,7 @@ use super::star::Stars;
 const MOST_ROUNDS: usize = 8;
 /// A change gains at least this share of the bends it touches: less is rounding.
 const LEAST_GAIN: f64 = 1e-6;
-/// Two cells are tried together where the surface turns by at least this angle, rad: on a smooth surface one cell is enough.
+/// Two and three cells are tried together where the surface turns by at least this angle, rad: on a smooth surface one cell is enough.
 const SHARP: f64 = 0.35;
 
 /// Turns cells until none gains; the number of changes.
