@@ -19,6 +19,11 @@ mod clouds;
 use clouds::score::cloud;
 use clouds::solids::{self, Hole, extrusion};
 
+const OPEN: Settings = Settings {
+    cone: true,
+    open: true,
+};
+
 /// The triangulation, checked.
 fn triangulated(points: &[DVec3]) -> Delaunay {
     let delaunay = Delaunay::new(points).expect("points that span space");
@@ -403,11 +408,7 @@ fn rayon_pool(threads: usize) -> rayon::ThreadPool {
 #[test]
 fn open_scans_keep_their_borders() {
     let sampled = solids::wedge(20.0, 2.0).sample(5_000, 0.05, 3);
-    let settings = Settings {
-        open: true,
-        ..Settings::default()
-    };
-    let made = mesh(&sampled.points, settings).expect("a body");
+    let made = mesh(&sampled.points, OPEN).expect("a body");
     let t = made.topology;
     assert!(
         t.is_manifold() && !t.is_watertight() && t.open_edges > 50,
@@ -425,10 +426,6 @@ fn open_scans_keep_their_borders() {
 
 #[test]
 fn an_exact_plane_is_an_open_mesh() {
-    let settings = Settings {
-        open: true,
-        ..Settings::default()
-    };
     // A grid with a hole in it, in three planes: the whole squares of the grid outside the hole are the mesh.
     let grid: Vec<(f64, f64)> = (0..61 * 41)
         .map(|i| (f64::from(i % 61), f64::from(i / 61)))
@@ -448,7 +445,7 @@ fn an_exact_plane_is_an_open_mesh() {
             refused,
             Err(DelaunayError::Flat { dimension: 2, .. })
         ));
-        let made = mesh(&points, settings).expect("an open mesh");
+        let made = mesh(&points, OPEN).expect("an open mesh");
         let t = made.topology;
         assert!(t.is_manifold() && t.pieces == 1, "{t:?}");
         // A ring; every point is a vertex.
@@ -473,11 +470,7 @@ fn a_scan_by_lines_from_one_side_is_a_sheet() {
     let view = DVec3::new(0.1, 0.05, 1.0).normalize();
     let block = solids::block();
     let sampled = block.scan(&[view], (along, across), 0.1 * along, 3);
-    let settings = Settings {
-        open: true,
-        ..Settings::default()
-    };
-    let made = mesh(&sampled.points, settings).expect("a body");
+    let made = mesh(&sampled.points, OPEN).expect("a body");
     let t = made.topology;
     assert!(t.is_manifold(), "{t:?}");
     // Points that noise puts across their neighbours on the line are passed by, and slits stay where they were.

@@ -126,6 +126,14 @@ fn is_one_around(delaunay: &Delaunay, inside: &[bool], cell: u32, (a, b): (u32, 
     }
 }
 
+/// What is known of a wrong vertex.
+pub(super) struct Look {
+    /// For every cell of its star the three beside it there.
+    pub beside: Vec<[u32; 3]>,
+    /// For every cell of its star how many more defects turning it makes there; empty where a cell has turned since.
+    pub changes: Vec<i8>,
+}
+
 /// Room for the look at all cells around one vertex.
 #[derive(Default)]
 pub(super) struct Around {

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use super::carve::carve;
 use super::check::topology;
-use super::defect::{Around, Ring, beside, change_of_right, defect};
+use super::defect::{Around, Look, Ring, beside, change_of_right, defect};
 use super::delaunay::{Delaunay, GHOST};
 use super::solid::{Solid, surface};
 use super::star::{Facets, Stars, corner};
@@ -174,14 +174,6 @@ struct Search<'a> {
     around: Around,
     /// Whether a search may begin with a row of cells from its vertex to the other side.
     may_dig: bool,
-}
-
-/// What is known of a wrong vertex.
-struct Look {
-    /// For every cell of its star the three beside it there.
-    beside: Vec<[u32; 3]>,
-    /// For every cell of its star how many more defects turning it makes there; empty where a cell has turned since.
-    changes: Vec<i8>,
 }
 
 /// Cells around a vertex above which it is a hub, as rows of points in one plane make them: looked at one by one they cost the square of their number.
