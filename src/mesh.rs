@@ -11,6 +11,7 @@ pub mod check;
 mod cone;
 mod curve;
 mod cut;
+mod defect;
 pub mod delaunay;
 pub mod mend;
 pub mod normals;
@@ -188,20 +189,7 @@ impl Body {
                 sources.push(self.delaunay.sources[v as usize]);
             }
         }
-        let mut triangles: Vec<[u32; 3]> = (triangles.into_iter())
-            .map(|t| {
-                let [a, b, c] = t.map(|v| numbers[v as usize]);
-                // Begun with the lowest: the mesh is the same whatever the order of the cells.
-                if a < b && a < c {
-                    [a, b, c]
-                } else if b < c {
-                    [b, c, a]
-                } else {
-                    [c, a, b]
-                }
-            })
-            .collect();
-        triangles.sort_unstable();
+        let triangles = numbered(triangles, &numbers);
         let mut seconds = self.seconds.clone();
         seconds.push(("surface", start.elapsed().as_secs_f64()));
         Mesh {
@@ -216,10 +204,69 @@ impl Body {
     }
 }
 
-/// Meshes `positions`, mm.
+/// Triangles of vertices of the triangulation with the `numbers` of the mesh, each begun with its lowest corner and sorted: the mesh is the same whatever
+/// the order of the cells.
+fn numbered(triangles: Vec<[u32; 3]>, numbers: &[u32]) -> Vec<[u32; 3]> {
+    let mut triangles: Vec<[u32; 3]> = (triangles.into_iter())
+        .map(|t| {
+            let [a, b, c] = t.map(|v| numbers[v as usize]);
+            if a < b && a < c {
+                [a, b, c]
+            } else if b < c {
+                [b, c, a]
+            } else {
+                [c, a, b]
+            }
+        })
+        .collect();
+    triangles.sort_unstable();
+    triangles
+}
+
+/// The mesh of `positions` that lie exactly in one plane: their Delaunay triangulation there, without what bridges the unseen; its front looks along Z, or along
+/// Y or X where the plane holds the axes before.
+///
+/// With one more point off the plane the cells are those over the plane's triangles: a sphere through it and a triangle's corners meets the
+/// plane in the circle through the corners. So all signs stay exact and nothing is shaken.
+fn plane_mesh(positions: &[DVec3]) -> Result<Mesh, DelaunayError> {
+    let start = Instant::now();
+    let (low, high) = curve::bounds(positions);
+    let size = (high - low).max_element();
+    // A plane holds two axes at the most.
+    let off = |axis: DVec3| {
+        let mut points = positions.to_vec();
+        points.push(positions.first().copied().unwrap_or(low) + axis * size);
+        Delaunay::new(&points)
+    };
+    let delaunay = (off(DVec3::Z).or_else(|_| off(DVec3::Y))).or_else(|_| off(DVec3::X))?;
+    let apex = delaunay.vertex_of[positions.len()];
+    let mut sources = delaunay.sources.clone();
+    sources.sort_unstable();
+    // The apex came last.
+    sources.pop();
+    let numbers: Vec<u32> = (delaunay.sources.iter())
+        .map(|s| sources.partition_point(|other| other < s) as u32)
+        .collect();
+    let triangles = numbered(open::plane_triangles(&delaunay, apex), &numbers);
+    Ok(Mesh {
+        positions: sources.iter().map(|s| positions[*s as usize]).collect(),
+        topology: topology(sources.len(), &triangles),
+        sources,
+        triangles,
+        matching: Matching::default(),
+        mending: Mending::default(),
+        seconds: vec![("plane", start.elapsed().as_secs_f64())],
+    })
+}
+
+/// Meshes `positions`, mm. Where they lie exactly in one plane there is an open mesh only.
 ///
 /// # Errors
 /// [`DelaunayError`].
 pub fn mesh(positions: &[DVec3], settings: Settings) -> Result<Mesh, DelaunayError> {
-    Ok(Body::new(positions, settings)?.mesh(positions, settings))
+    match Body::new(positions, settings) {
+        Ok(body) => Ok(body.mesh(positions, settings)),
+        Err(DelaunayError::Flat { dimension: 2, .. }) if settings.open => plane_mesh(positions),
+        Err(error) => Err(error),
+    }
 }

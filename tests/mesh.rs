@@ -19,6 +19,11 @@ mod clouds;
 use clouds::score::cloud;
 use clouds::solids::{self, Hole, extrusion};
 
+const OPEN: Settings = Settings {
+    cone: true,
+    open: true,
+};
+
 /// The triangulation, checked.
 fn triangulated(points: &[DVec3]) -> Delaunay {
     let delaunay = Delaunay::new(points).expect("points that span space");
@@ -403,11 +408,7 @@ fn rayon_pool(threads: usize) -> rayon::ThreadPool {
 #[test]
 fn open_scans_keep_their_borders() {
     let sampled = solids::wedge(20.0, 2.0).sample(5_000, 0.05, 3);
-    let settings = Settings {
-        open: true,
-        ..Settings::default()
-    };
-    let made = mesh(&sampled.points, settings).expect("a body");
+    let made = mesh(&sampled.points, OPEN).expect("a body");
     let t = made.topology;
     assert!(
         t.is_manifold() && !t.is_watertight() && t.open_edges > 50,
@@ -424,17 +425,52 @@ fn open_scans_keep_their_borders() {
 }
 
 #[test]
+fn an_exact_plane_is_an_open_mesh() {
+    // A grid with a hole in it, in three planes: the whole squares of the grid outside the hole are the mesh.
+    let grid: Vec<(f64, f64)> = (0..61 * 41)
+        .map(|i| (f64::from(i % 61), f64::from(i / 61)))
+        .filter(|(x, y)| (x - 30.0).hypot(y - 20.0) > 10.0)
+        .collect();
+    for (place, front) in [
+        (
+            (|x, y| DVec3::new(x, y, 3.0)) as fn(f64, f64) -> DVec3,
+            DVec3::Z,
+        ),
+        (|x, y| DVec3::new(x, 3.0, y), DVec3::Y),
+        (|x, y| DVec3::new(x, y, x + y), DVec3::new(-1.0, -1.0, 1.0)),
+    ] {
+        let points: Vec<DVec3> = grid.iter().map(|(x, y)| place(*x, *y)).collect();
+        let refused = mesh(&points, Settings::default()).map(|_| ());
+        assert!(matches!(
+            refused,
+            Err(DelaunayError::Flat { dimension: 2, .. })
+        ));
+        let made = mesh(&points, OPEN).expect("an open mesh");
+        let t = made.topology;
+        assert!(t.is_manifold() && t.pieces == 1, "{t:?}");
+        // A ring; every point is a vertex.
+        assert_eq!((t.euler, t.vertices), (0, points.len()));
+        let sum: DVec3 = (made.triangles.iter())
+            .map(|t| {
+                let [a, b, c] = t.map(|v| made.positions[v as usize]);
+                (b - a).cross(c - a) / 2.0
+            })
+            .sum();
+        // Of the hole at least the square in its circle stays open, and no more than the circle with a step around it.
+        let open = 60.0 * 40.0 - sum.dot(front) / front.length_squared();
+        assert!((200.0..380.2).contains(&open), "{open} of the plane");
+        assert!(sum.cross(front).length() < 1e-9 * sum.length());
+    }
+}
+
+#[test]
 fn a_scan_by_lines_from_one_side_is_a_sheet() {
     // Lines ten times sparser than the points along them.
     let (along, across) = (0.2, 2.0);
     let view = DVec3::new(0.1, 0.05, 1.0).normalize();
     let block = solids::block();
     let sampled = block.scan(&[view], (along, across), 0.1 * along, 3);
-    let settings = Settings {
-        open: true,
-        ..Settings::default()
-    };
-    let made = mesh(&sampled.points, settings).expect("a body");
+    let made = mesh(&sampled.points, OPEN).expect("a body");
     let t = made.topology;
     assert!(t.is_manifold(), "{t:?}");
     // Points that noise puts across their neighbours on the line are passed by, and slits stay where they were.
@@ -655,6 +691,7 @@ fn the_program_meshes_writes_and_refuses() {
     let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("mesh");
     std::fs::create_dir_all(&folder).expect("a folder");
     let at = |name: &str| folder.join(name).display().to_string();
+    let mut random = clouds::Random::new(11);
     let points = solids::cube_with_hole(10.0).even(1_500, 200).points;
     let lines: Vec<String> = points
         .iter()
@@ -728,6 +765,22 @@ fn the_program_meshes_writes_and_refuses() {
         assert_eq!(acies(&[command, &at("absent.xyz")]).0, 74);
     }
     assert_eq!(topology(0, &[]).vertices, 0);
+
+    let (status, said, wrong) = acies(&["mesh", &at("flat.xyz"), "--open"]);
+    assert_eq!(status, 0, "{wrong}");
+    assert!(said.starts_with("5 vertices, 3 triangles"), "{said}");
+
+    // Points in a volume are on no surface.
+    let lines: Vec<String> = (0..3_000)
+        .map(|_| random.unit())
+        .collect::<Vec<f64>>()
+        .chunks(3)
+        .map(|c| format!("{} {} {}", c[0], c[1], c[2]))
+        .collect();
+    std::fs::write(at("volume.xyz"), lines.join("\n")).expect("a scan");
+    let (status, said, wrong) = acies(&["mesh", &at("volume.xyz")]);
+    assert_eq!(status, 0, "{wrong}");
+    assert!(said.contains("do not lie on a surface"), "{said}");
 
     // Points that are no part of the surface are in the mesh, and told.
     let mut sphere = bodies::ellipsoid(2_000, DVec3::ONE * 10.0).points;

@@ -7,8 +7,8 @@ use std::collections::HashMap;
 
 use super::Body;
 use super::check::Groups;
-use super::delaunay::{Delaunay, GHOST};
-use super::sheet::{is_needle, sheet};
+use super::delaunay::{Delaunay, GHOST, place};
+use super::sheet::{BRIDGE, is_needle, sheet};
 use super::star::vertices;
 
 /// An edge longer than so many times the typical ones of nine in ten vertices bridges whatever its surroundings.
@@ -28,6 +28,30 @@ pub(super) fn seen_triangles(body: &Body) -> Vec<[u32; 3]> {
     };
     let count = delaunay.points.len();
     without_specks(count, one_fan_each(count, sheet(body, is_seen)))
+}
+
+/// The triangles of points in one plane that bridge nothing, their front towards `apex`, the one vertex that lies off the plane.
+pub(super) fn plane_triangles(delaunay: &Delaunay, apex: u32) -> Vec<[u32; 3]> {
+    let mut triangles: Vec<[u32; 3]> = (0..delaunay.cells.len() as u32)
+        .filter(|c| !delaunay.is_ghost(*c))
+        .map(|c| c << 2 | place(&delaunay.cells[c as usize], apex) as u32)
+        .map(|f| vertices(delaunay, f))
+        // Facets are seen from the other side than their corner.
+        .map(|[a, b, c]| [a, c, b])
+        .collect();
+    let typical = typical_edges(delaunay, &triangles);
+    let most = longest_seen(&typical);
+    // No point of another sheet is near: an edge into a sparser place is none that bridges.
+    let is_seen = |t: &[u32; 3]| {
+        (0..3).all(|k| {
+            let (a, b) = (t[k], t[(k + 1) % 3]);
+            let length = delaunay.points[a as usize].distance(delaunay.points[b as usize]);
+            length <= (BRIDGE * typical[a as usize].max(typical[b as usize])).min(most)
+        })
+    };
+    triangles.retain(is_seen);
+    // Noise hangs no specks into a plane.
+    one_fan_each(delaunay.points.len(), triangles)
 }
 
 /// Leaves out pieces of a few triangles around none of whose vertices they close: what noise hangs into the slits between scan lines.

@@ -1,21 +1,21 @@
 //! Edges of the mesh laid along the sharp edges of the part.
 //!
 //! We differ: the cone of the thesis works only while umbrellas are matched, and takes part only where they do not match at once (Ma 2011,
-//! §5.4.3). Afterwards cells are turned, one or two neighbours at a time, where that gathers the bends of the surface on fewer and shorter
+//! §5.4.3). Afterwards cells are turned, up to three neighbours at a time, where that gathers the bends of the surface on fewer and shorter
 //! edges: one cell that fills the four corners of two triangles exchanges their diagonal. The mesh stays made of Delaunay facets: it cannot
 //! cross itself.
 
 use glam::DVec3;
 
+use super::defect::{Ring, change_of_right, defect};
 use super::delaunay::{Delaunay, GHOST};
-use super::mend::{Ring, defect};
 use super::star::Stars;
 
 /// Rounds over all cells; later ones change next to nothing.
 const MOST_ROUNDS: usize = 8;
 /// A change gains at least this share of the bends it touches: less is rounding.
 const LEAST_GAIN: f64 = 1e-6;
-/// Two cells are tried together where the surface turns by at least this angle, rad: on a smooth surface one cell is enough.
+/// Two and three cells are tried together where the surface turns by at least this angle, rad: on a smooth surface one cell is enough.
 const SHARP: f64 = 0.35;
 
 /// Turns cells until none gains; the number of changes.
@@ -43,11 +43,22 @@ pub fn sharpen(delaunay: &Delaunay, stars: &Stars, inside: &mut [bool]) -> usize
             if !turned && work.is_sharp_at(cell) {
                 let side = work.inside[cell as usize];
                 let beside = delaunay.neighbors[cell as usize];
-                turned = beside.into_iter().any(|n| {
-                    !delaunay.is_ghost(n)
-                        && work.inside[n as usize] == side
-                        && work.try_turning(&[cell, n])
-                });
+                let may_follow =
+                    |w: &Work, n: u32| !delaunay.is_ghost(n) && w.inside[n as usize] == side;
+                turned = beside
+                    .into_iter()
+                    .any(|n| may_follow(&work, n) && work.try_turning(&[cell, n]));
+                turned = turned
+                    || beside.into_iter().any(|n| {
+                        may_follow(&work, n)
+                            && (beside.into_iter().filter(|m| *m > n))
+                                .chain(
+                                    delaunay.neighbors[n as usize]
+                                        .into_iter()
+                                        .filter(|m| *m != cell),
+                                )
+                                .any(|m| may_follow(&work, m) && work.try_turning(&[cell, n, m]))
+                    });
             }
             if turned {
                 changed += 1;
@@ -110,6 +121,9 @@ impl Work<'_> {
 
     /// Turns cells if that leaves all vertices right and the bends less.
     fn try_turning(&mut self, cells: &[u32]) -> bool {
+        if !self.keeps_count(cells) {
+            return false;
+        }
         self.edges.clear();
         self.corners.clear();
         for &cell in cells {
@@ -132,17 +146,39 @@ impl Work<'_> {
         self.flip(cells);
         let after = self.bends();
         let gains = after.is_some_and(|after| before - after > LEAST_GAIN * before);
-        if gains && self.are_right() {
-            // Vertices that were wrong before stay as they are.
+        self.flip(cells);
+        // Vertices that were wrong before stay as they are.
+        let may_turn = gains && self.are_right() && self.stay_right(cells);
+        if may_turn {
             self.flip(cells);
-            let were_right = self.are_right();
-            if were_right {
-                self.flip(cells);
-            }
-            return were_right;
+        }
+        may_turn
+    }
+
+    /// Whether the surface has as many triangles after cells, all on one side, are turned: through the same vertices another number is another
+    /// number of pieces or handles.
+    fn keeps_count(&self, cells: &[u32]) -> bool {
+        let beside = cells
+            .iter()
+            .flat_map(|c| self.delaunay.neighbors[*c as usize]);
+        let is_across = |n: u32| self.inside[n as usize] != self.inside[cells[0] as usize];
+        let sum: i32 = beside
+            .filter(|n| !cells.contains(n))
+            .map(|n| if is_across(n) { -1 } else { 1 })
+            .sum();
+        sum == 0
+    }
+
+    /// Whether vertices that are right are so after cells are turned.
+    fn stay_right(&mut self, cells: &[u32]) -> bool {
+        if let [cell] = cells {
+            let mut corners = self.corners.iter();
+            return corners.all(|v| change_of_right(self.delaunay, self.inside, *v, *cell) == 0);
         }
         self.flip(cells);
-        false
+        let are_right = self.are_right();
+        self.flip(cells);
+        are_right
     }
 
     fn flip(&mut self, cells: &[u32]) {

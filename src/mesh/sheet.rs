@@ -18,7 +18,7 @@ const FOLD: f64 = 0.906;
 
 /// A triangle bridges where an edge of it is longer than so many times the typical edges at its ends: a scan line is up to twenty
 /// times denser along than across, and there typical is the longer.
-const BRIDGE: f64 = 4.0;
+pub(super) const BRIDGE: f64 = 4.0;
 /// The same for facets that nothing speaks for but that two of their edges are borders: they close slits and must not creep over holes.
 const FILL: f64 = 1.5;
 /// Level of such facets.
