@@ -177,7 +177,7 @@ struct Search<'a> {
 }
 
 /// Cells around a vertex above which it is a hub, as rows of points in one plane make them: looked at one by one they cost the square of their number.
-/// Measured on the bench and 21 thin plates: 64, 1,024 and no such limit give the same meshes.
+/// Measured on the bench and 21 thin plates: 64, 1,024 and no such limit give the same genus, links and volumes.
 const HUB: usize = 256;
 /// Wrong vertices whose cells are looked at for one turn.
 const LOOKED_AT: usize = 3;
@@ -400,7 +400,7 @@ impl Search<'_> {
     /// Joins islands, closed pieces of a few vertices beside the others, to what lies nearest: a row of cells is turned, and what has to follow. Kept
     /// is what makes one piece of two without a handle.
     fn join_islands(&mut self) -> usize {
-        /// Vertices of the largest island; more are a body, or a void, of its own. Measured like [`HUB`]: 20 and 500 give the same meshes.
+        /// Vertices of the largest island; more are a body, or a void, of its own. Measured like [`HUB`]: 20 and 500 give the same figures.
         const ISLAND: usize = 100;
         const MOST: usize = 1_000;
         let triangles = super::solid::surface(self.delaunay, &self.solid.inside);
