@@ -83,8 +83,10 @@ impl Sampled {
 
 impl std::fmt::Debug for Sampled {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let count = self.samples.len();
-        write!(f, "{count} samples {} mm apart", self.spacing_mm)
+        f.debug_struct("Sampled")
+            .field("samples", &self.samples.len())
+            .field("spacing_mm", &self.spacing_mm)
+            .finish_non_exhaustive()
     }
 }
 
