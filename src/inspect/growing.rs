@@ -440,7 +440,7 @@ impl<'a, B: Body> Growing<'a, B> {
         let settled = settle(&scan, &self.surface, self.request.start, &options, known);
         if let Some(pose) = settled {
             // Half of what would be too far at the end: it may go on.
-            self.lay_again(pose, 0.5 * SMALL_MOTION, true);
+            self.lay_again(pose, 0.5 * SMALL_MOTION);
         }
     }
 
@@ -504,15 +504,14 @@ impl<'a, B: Body> Growing<'a, B> {
             return RigidTransform::IDENTITY;
         };
         let motion = pose * base.pose.inverse();
-        if self.lay_again(pose, SMALL_MOTION, false) {
+        if self.lay_again(pose, SMALL_MOTION) {
             return RigidTransform::IDENTITY;
         }
         motion
     }
 
-    /// Lays everything at `pose` where it is farther from the base than `far` times the noise; the poses that fitted are kept if the scan
-    /// goes on.
-    fn lay_again(&mut self, pose: RigidTransform, far: f64, goes_on: bool) -> bool {
+    /// Lays everything at `pose` where it is farther from the base than `far` times the noise; whether it was.
+    fn lay_again(&mut self, pose: RigidTransform, far: f64) -> bool {
         let Some(base) = &mut self.base else {
             return false;
         };
@@ -524,7 +523,6 @@ impl<'a, B: Body> Growing<'a, B> {
         tracing::debug!(
             moved_mm = moved,
             points = self.points,
-            goes_on,
             "the pose has moved too far: all points are laid again"
         );
         let known = (base.spacing, base.noise_mm);
@@ -577,6 +575,8 @@ mod tests {
     use glam::DVec3;
 
     use super::*;
+    use crate::inspect::Recipe;
+    use crate::inspect::align::Twist;
     use crate::nominal::Nominal;
     use crate::points::{Origin, View};
 
@@ -628,12 +628,15 @@ mod tests {
         Nominal::read(&path).expect("the demo's part")
     }
 
+    fn growing<'a>(nominal: &'a Nominal, recipe: &'a Recipe) -> Growing<'a, Nominal> {
+        let start = Start::Rough(RigidTransform::IDENTITY);
+        Growing::new(Surface::new(nominal), Request::new(recipe, start))
+    }
+
     #[test]
     fn coarse_lines_are_aligned_as_they_come() {
-        let nominal = demo_part();
-        let recipe = super::super::Recipe::default();
-        let request = Request::new(&recipe, Start::Rough(RigidTransform::IDENTITY));
-        let mut growing = Growing::new(Surface::new(&nominal), request);
+        let (nominal, recipe) = (demo_part(), Recipe::default());
+        let mut growing = growing(&nominal, &recipe);
         for piece in coarse_lines(&nominal) {
             growing.push(piece);
         }
@@ -648,10 +651,8 @@ mod tests {
 
     #[test]
     fn a_pose_that_turns_out_otherwise_on_the_way_is_left() {
-        let nominal = demo_part();
-        let recipe = super::super::Recipe::default();
-        let request = Request::new(&recipe, Start::Rough(RigidTransform::IDENTITY));
-        let mut growing = Growing::new(Surface::new(&nominal), request);
+        let (nominal, recipe) = (demo_part(), Recipe::default());
+        let mut growing = growing(&nominal, &recipe);
         let pieces = coarse_lines(&nominal);
         let (first, rest) = pieces.split_at(pieces.len() * 2 / 3);
         first.iter().for_each(|piece| growing.push(piece.clone()));
@@ -668,7 +669,7 @@ mod tests {
             growing.measure();
         }
         let base = growing.base.as_ref().expect("a base");
-        let off = super::super::align::Twist::logarithm(&base.pose).size(growing.surface.size_mm());
+        let off = Twist::logarithm(&base.pose).size(growing.surface.size_mm());
         assert!(off < SMALL_MOTION * base.noise_mm, "{off}");
     }
 }

@@ -283,7 +283,7 @@ pub fn surface(delaunay: &Delaunay, inside: &[bool]) -> Vec<[u32; 3]> {
 /// Turned one by one, cells stop at what no single one improves: slivers across the mouth of a hole, a wrong handle that takes three at once.
 /// The half leaves umbrellas their choice between facets of like size, which decides where edges run.
 ///
-/// Of the two weights the figures of the bench depend little. Of its 15 closed bodies (tables 5.2 and the peers up to 58,720 points) all have their true genus at a vote of 1/16, 1/4 and
+/// The two weights are chosen, and matter beyond a range. Of the bench's 15 closed bodies (tables 5.2 and the peers up to 58,720 points) all have their true genus at a vote of 1/16, 1/4 and
 /// 1/2 and a free share of 1/2, 3/4 and 1; at a vote of 1/8 and at free shares of 0 and 1/4 the body with three holes loses it, at a vote of 1 the fandisk does.
 /// Links along true edges are the same at all nine.
 pub fn settle(delaunay: &Delaunay, stars: &Stars, facets: &Facets, solid: &mut Solid) {
