@@ -86,12 +86,16 @@ impl Language {
         text.replace('.', self.text("decimal"))
     }
 
-    /// What the program says in English, in this language; what is not the program's stays as it is.
+    /// What the program says in English, in this language, line by line; what is not the program's stays as it is.
     pub fn said(self, english: &str) -> String {
-        if self == Language::En || english.len() > LONGEST {
+        if self == Language::En {
             return english.to_owned();
         }
-        self.told(english).unwrap_or_else(|| english.to_owned())
+        let lines = english.split('\n').map(|line| {
+            let told = (line.len() <= LONGEST).then(|| self.told(line)).flatten();
+            told.unwrap_or_else(|| line.to_owned())
+        });
+        lines.collect::<Vec<_>>().join("\n")
     }
 
     /// `None` where nothing of it is known. Every part is looked at once: no text makes this slow.
@@ -316,6 +320,20 @@ mod tests {
         let long = "no points; ".repeat(400);
         assert_eq!(told(&long), long);
         assert_eq!(Language::En.said("no points"), "no points");
+    }
+
+    #[test]
+    fn mistakes_of_a_recipe_are_told_line_by_line() {
+        assert_eq!(
+            Language::De.said(
+                "recipe: edge[0].judged: false beside limits, expected one of the two\n\
+                 recipe: limits.d1_mm: [0.5, -0.5], expected two numbers, the lower limit then the upper\n\
+                 recipe: datum[1].name: \"A\" again, expected one name a datum"
+            ),
+            "recipe: edge[0].judged: false neben Grenzen, erwartet eines von beiden\n\
+             recipe: limits.d1_mm: [0.5, -0.5], erwartet zwei Zahlen, erst die untere, dann die obere Grenze\n\
+             recipe: datum[1].name: „A“ erneut, erwartet ein Name je Bezug"
+        );
     }
 
     #[test]

@@ -455,7 +455,7 @@ mod tests {
         let mistakes = Recipe::parse(text).expect_err("thirteen mistakes");
         let lines: Vec<String> = mistakes.iter().map(Mistake::to_string).collect();
         for expected in [
-            "rule: \"strict\", expected \"simple\", { guard_band = k }",
+            "rule: \"strict\", expected \"simple\", or a table of guard_band",
             "minimum_coverage: 2, expected a number of 0 to 1",
             "colour: an unknown key, expected one of limits, environment, alignment, expansion, rule, limits_from_pmi, edge",
             "datum_faces: [\"a\"], expected numbers of STEP entities",

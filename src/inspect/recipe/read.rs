@@ -208,7 +208,8 @@ fn read_expansion(keys: &mut Keys) -> Option<Expansion> {
 }
 
 fn rule(keys: &mut Keys) -> Option<Rule> {
-    let expected = "\"simple\", { guard_band = k } with k of 0 to 10, or { conformance = p } with p of 0.5 to 0.9999";
+    let expected =
+        "\"simple\", or a table of guard_band, 0 to 10, or of conformance, 0.5 to 0.9999";
     keys.read("rule", expected, |value| match value {
         Value::String(word) if word == "simple" => Some(Rule::Simple),
         Value::Table(table) if table.len() == 1 => {

@@ -109,10 +109,10 @@ function told(text) {
   return one ? retold(one) : pieces(text);
 }
 
-/** What the program says in English, in the page's language; what is not the program's (a device's error, a name) stays as it is. */
+/** What the program says in English, in the page's language, line by line; what is not the program's (a device's error, a name) stays as it is. */
 export function said(english) {
-  if (language === "en" || !english || english.length > LONGEST) return english ?? "";
-  return told(english) ?? english;
+  if (language === "en" || !english) return english ?? "";
+  return english.split("\n").map((line) => (line.length > LONGEST ? line : told(line) ?? line)).join("\n");
 }
 
 /** A number with so many digits behind the point. */
