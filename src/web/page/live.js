@@ -6,6 +6,8 @@ import { t } from "./text.js";
 
 /** Between two looks at the daemon, ms: quick enough to look alive, slow enough for a tablet. */
 const EVERY_MS = 200;
+/** After the scan the verdict is computed, perhaps on the machine that shows the page: the last look waits for it, ms. */
+const LAST_MS = 600;
 /** A frame of numbers does not move when nothing new came: the picture is drawn only then. */
 const HUES = ["--line-1", "--line-2", "--line-3", "--line-4"];
 
@@ -40,10 +42,12 @@ export function livePictures() {
     element,
     run(now) {
       if (now === running) return;
+      const before = running;
       running = now;
       clearTimeout(timer);
       // Once more at the end: the last points came after the last look.
-      look();
+      if (before && !now) timer = setTimeout(look, LAST_MS);
+      else look();
     },
     end() {
       ended = true;

@@ -8,6 +8,8 @@ import { advised, badge, because, limits, outcome, SIGNS, valued, worstFirst } f
 
 /** Lines of the short table; the whole one is a click away. */
 const WORST = 6;
+/** So long a verdict may take before the bar begins to move, ms. */
+const PATIENCE_MS = 1000;
 
 export function measure(view, page) {
   const sign = h("span.sign", { "aria-hidden": "true" });
@@ -38,6 +40,7 @@ export function measure(view, page) {
   const reset = button("reset");
   const waiting = h("p.note", { id: "waiting" });
   const live = livePictures();
+  let patience = 0;
   const result = h("section.card", { id: "result", hidden: true });
   fill(view, h("div.measure", {},
     h("div.left", {}, board, result),
@@ -70,7 +73,18 @@ export function measure(view, page) {
     serial.focus();
   }
 
+  /** The bar is full; it moves only where the verdict is long in coming, because drawing that takes from the computing. */
+  function computes() {
+    if (patience) return;
+    bar.value = 1;
+    patience = setTimeout(() => bar.removeAttribute("value"), PATIENCE_MS);
+  }
+
   function told(snapshot) {
+    if ((snapshot.acquiring ?? snapshot.computing.at(-1))?.step !== "inspecting") {
+      clearTimeout(patience);
+      patience = 0;
+    }
     const running = snapshot.acquiring;
     const computing = snapshot.computing.at(-1);
     const ready = snapshot.state === "ready";
@@ -92,7 +106,7 @@ export function measure(view, page) {
       say(part, job.part_serial);
       say(reason, said(job.findings.at(-1)));
       say(advice, "");
-      if (job.step === "inspecting") bar.removeAttribute("value");
+      if (job.step === "inspecting") computes();
       else bar.value = job.step === "touching" && job.touches ? job.touches[0] / job.touches[1] : job.share;
       say(step, job.step === "touching" && job.touches ? t("touches", { done: job.touches[0], of: job.touches[1] }) : t("profiles", { count: job.profiles }));
     } else if (snapshot.cause) {
