@@ -84,6 +84,12 @@ pub enum Refusal {
         "the part has no serial number; type or scan one, a result without it belongs to no part"
     )]
     NoSerial,
+    /// The inspection that is to be repeated is not there.
+    #[error("inspection {first} is to be repeated, but it is not in the history")]
+    NothingToRepeat {
+        /// Its number, as given.
+        first: i64,
+    },
     /// The store.
     #[error("{0}")]
     Store(String),

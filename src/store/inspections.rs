@@ -3,7 +3,8 @@
 use std::time::SystemTime;
 
 use rusqlite::{Connection, OptionalExtension, Row, params};
-use serde::{Deserialize, Serialize};
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
 use utoipa::{IntoParams, ToSchema};
 
 use super::{Store, StoreError, millis, pack, rfc3339, unpack};
@@ -37,8 +38,23 @@ pub struct Order {
     #[serde(default)]
     pub purpose: Purpose,
     /// The inspection of the same part that this one repeats; its result is kept.
-    #[serde(default)]
+    #[serde(default, deserialize_with = "whole")]
     pub remeasure_of: Option<i64>,
+}
+
+/// A whole number or null. `4.0` is an integer to JSON Schema, and some clients write all numbers so.
+fn whole<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<i64>, D::Error> {
+    let Some(number) = Option::<serde_json::Number>::deserialize(deserializer)? else {
+        return Ok(None);
+    };
+    // Beyond 2^53 a float no longer says which whole number it is.
+    let of_float = |x: f64| (x.fract() == 0.0 && x.abs() < 9e15).then_some(x as i64);
+    let whole = number
+        .as_i64()
+        .or_else(|| number.as_f64().and_then(of_float));
+    whole
+        .map(Some)
+        .ok_or_else(|| D::Error::custom(format!("{number} is not a whole number of 64 bits")))
 }
 
 /// Somebody's press on Start.

@@ -176,6 +176,13 @@ impl Problem {
                 detail,
                 "type or scan the part's serial number",
             ),
+            Refusal::NothingToRepeat { .. } => Self::new(
+                StatusCode::UNPROCESSABLE_ENTITY,
+                "nothing-to-repeat",
+                title,
+                detail,
+                "give the number of an inspection in the history, or none",
+            ),
             Refusal::Store(_) => Self::new(
                 StatusCode::SERVICE_UNAVAILABLE,
                 "store",

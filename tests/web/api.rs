@@ -390,3 +390,23 @@ fn commands_answer_with_nothing_and_stand_in_the_audit_log() {
         );
     }
 }
+
+#[test]
+fn a_part_that_repeats_an_unknown_inspection_is_refused_and_the_refusal_kept() {
+    let cell = measured();
+    let again = |first: serde_json::Value| {
+        let order = json!({"part_serial": "SN-R", "remeasure_of": first});
+        cell.post("/api/v1/inspections", &order)
+    };
+    // To JSON Schema 999.0 is an integer.
+    for first in [json!(999), json!(999.0)] {
+        let problem = again(first).problem(422, "nothing-to-repeat");
+        let kept = problem["inspection"].as_i64().expect("its number");
+        let kept = cell.get(&format!("/api/v1/inspections/{kept}")).json();
+        assert_eq!(kept["phase"], "refused");
+        assert_eq!(kept["remeasure_of"], serde_json::Value::Null);
+    }
+    for first in [json!(1.5), json!(1e19), json!("1")] {
+        again(first).problem(422, "body");
+    }
+}

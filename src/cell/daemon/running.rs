@@ -224,10 +224,23 @@ impl Running {
         Ok(())
     }
 
-    fn start(&mut self, order: Order, operator: &str, key: Option<&str>, mode: Mode) -> Started {
+    fn start(
+        &mut self,
+        mut order: Order,
+        operator: &str,
+        key: Option<&str>,
+        mode: Mode,
+    ) -> Started {
         let mut admitted = self.admits();
         if order.part_serial.trim().is_empty() {
             admitted = admitted.and(Err(Refusal::NoSerial));
+        }
+        if let Some(first) = order.remeasure_of
+            && let Err(StoreError::Missing { .. }) = self.store.inspection(first)
+        {
+            admitted = admitted.and(Err(Refusal::NothingToRepeat { first }));
+            // The refusal is kept, and cannot refer to what is not there.
+            order.remeasure_of = None;
         }
         let now = SystemTime::now();
         let trigger = Trigger {

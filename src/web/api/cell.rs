@@ -13,7 +13,7 @@ use axum::response::{IntoResponse, Response};
 use futures_util::{StreamExt as _, stream};
 use serde::Deserialize;
 use tokio::sync::watch;
-use utoipa::IntoParams;
+use utoipa::{IntoParams, ToSchema};
 
 use super::Whole;
 use crate::cell::{Command, DeviceStatus, Handle, LiveEdges, LiveProfile, Snapshot};
@@ -44,7 +44,7 @@ pub async fn devices(State(app): State<App>) -> Json<Vec<DeviceStatus>> {
 /// instead: what was read before may have changed without a word. A client that does not keep up gets the same.
 #[utoipa::path(get, path = "/api/v1/events", tag = "cell",
     params(("Last-Event-ID" = Option<String>, Header, description = "the last event that was seen")),
-    responses((status = 200, description = "events without end", content_type = "text/event-stream", body = String)))]
+    responses((status = 200, description = "events without end", content_type = "text/event-stream", body = LiveEvent)))]
 pub async fn events(State(app): State<App>, headers: HeaderMap) -> Result<Response, Problem> {
     let place = app.stream_place()?;
     let follower = Follower::new(app.handle().clone(), headers.get("last-event-id"));
@@ -56,6 +56,18 @@ pub async fn events(State(app): State<App>, headers: HeaderMap) -> Result<Respon
     let events = events.take_until(async move { app.stopped().await });
     let keep_alive = KeepAlive::new().interval(KEEP_ALIVE).text("alive");
     Ok(Sse::new(events).keep_alive(keep_alive).into_response())
+}
+
+/// One of the server-sent events, with the fields of its lines.
+#[derive(ToSchema)]
+#[expect(dead_code, reason = "describes what goes out line by line")]
+struct LiveEvent {
+    /// `snapshot` or `resync`.
+    event: String,
+    /// When the daemon was started and the event's number; a `resync` has none.
+    id: Option<String>,
+    /// JSON: of a `snapshot` what `/status` answers, of a `resync` an object with its `reason`.
+    data: String,
 }
 
 /// One client of the events: what it has seen, and what it is still owed.
