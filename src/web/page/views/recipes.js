@@ -15,7 +15,7 @@ export function recipes(view, page, [id]) {
       const all = await get("/recipes");
       const rows = all.map((one) => ({
         go: `#/recipes/${one.id}`,
-        cells: [h("a", { href: `#/recipes/${one.id}` }, `#${one.id}`), one.active ? h("span.badge", { "data-verdict": "ok" }, "✓ ", t("active")) : "", `${one.name} v${one.version}`, one.nominal_name, one.author, time(one.created), one.why],
+        cells: [h("a", { href: `#/recipes/${one.id}` }, `#${one.id}`), one.active ? h("span.badge", { "data-verdict": "ok" }, "✓ ", t("active")) : "", `${one.name} v${one.version}`, one.nominal_name, one.author, time(one.created), said(one.why)],
       }));
       fill(list, table(["id", "active", "recipe", "nominal", "author", "created", "why"].map((name) => t(`column.${name}`)), rows),
         page.may("setter") ? h("div.row", {}, h("button", { type: "button", onclick: () => file.click() }, t("import")),
