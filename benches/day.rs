@@ -34,10 +34,6 @@ const SHIFTS: u32 = 8;
 /// How often something is written down, in hours of the cell.
 const LOOK_EVERY_H: f64 = 0.25;
 
-/// The program's allocator.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 fn main() {
     let numbers: Vec<f64> = std::env::args().filter_map(|a| a.parse().ok()).collect();
     let hours = numbers.first().copied().unwrap_or(24.0);

@@ -32,10 +32,6 @@ const STEP: &str = "62";
 /// Profiles a second: the 760 of a scan take 10 s.
 const RATE: &str = "76.0";
 
-/// The program's allocator.
-#[global_allocator]
-static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
-
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let rounds = arguments.iter().find_map(|a| a.parse().ok()).unwrap_or(50);

@@ -14,6 +14,10 @@ use acies_drivers::link::cable::Cable;
 use acies_simulators::demo_cell::DemoCell;
 use acies_simulators::wire::Wire;
 
+/// The program's allocator: memory is looked at as it is there.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 /// Longer than anything here may take.
 const LONG: Duration = Duration::from_secs(120);
 
