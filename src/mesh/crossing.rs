@@ -116,3 +116,46 @@ impl Flat {
         from * to <= 0.0 && first * second <= 0.0
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn triangles_overlap_beyond_what_they_share() {
+        // Ids are places of a small lattice, so that shared corners are equal ones.
+        let at = |i: u32| DVec3::new(f64::from(i % 5), f64::from(i / 5 % 5), f64::from(i / 25));
+        let signs = Signs::of(&(0..125).map(at).collect::<Vec<_>>());
+        let v = |x: u32, y: u32, z: u32| x + 5 * y + 25 * z;
+        let made = |ids: [u32; 3]| (ids, ids.map(at));
+        let floor = made([v(0, 0, 1), v(4, 0, 1), v(0, 4, 1)]);
+        for (other, expected) in [
+            // Apart, through, touching with a corner, in the plane beside and upon.
+            ([v(0, 0, 2), v(4, 0, 2), v(0, 4, 2)], false),
+            ([v(1, 1, 0), v(1, 1, 2), v(2, 1, 2)], true),
+            ([v(1, 1, 1), v(1, 1, 2), v(2, 1, 2)], true),
+            ([v(4, 4, 1), v(4, 1, 1), v(3, 4, 1)], false),
+            ([v(4, 4, 1), v(2, 2, 1), v(3, 4, 1)], true),
+            ([v(4, 4, 1), v(1, 1, 1), v(4, 2, 1)], true),
+            // One corner shared: away, through, along the plane.
+            ([v(0, 0, 1), v(0, 0, 2), v(1, 1, 2)], false),
+            ([v(0, 0, 1), v(2, 2, 0), v(2, 2, 2)], true),
+            ([v(0, 0, 1), v(4, 4, 1), v(4, 3, 1)], true),
+            ([v(4, 0, 1), v(4, 4, 1), v(3, 4, 1)], false),
+            // An edge shared: bent, opposite, folded over.
+            ([v(0, 0, 1), v(4, 0, 1), v(0, 4, 2)], false),
+            ([v(4, 0, 1), v(0, 4, 1), v(4, 4, 1)], false),
+            ([v(4, 0, 1), v(0, 4, 1), v(1, 1, 1)], true),
+        ] {
+            assert_eq!(overlap(&signs, &floor, &made(other)), expected, "{other:?}");
+            assert_eq!(overlap(&signs, &made(other), &floor), expected, "{other:?}");
+        }
+        let cell = [v(0, 0, 0), v(4, 0, 0), v(0, 4, 0), v(0, 0, 4)].map(at);
+        assert!(is_within(&signs, cell, at(v(1, 1, 1))) && is_within(&signs, cell, at(v(2, 2, 0))));
+        assert!(!is_within(&signs, cell, at(v(2, 2, 2))));
+        let square = [v(0, 0, 0), v(2, 2, 0), v(2, 0, 0), v(0, 2, 0)].map(at);
+        let [a, b, c, d] = square;
+        assert!(diagonals_cross(a, b, c, d) && !diagonals_cross(a, c, b, d));
+        assert!(!diagonals_cross(a, b, c, at(v(1, 1, 0))));
+    }
+}
