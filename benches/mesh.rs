@@ -227,7 +227,7 @@ fn table52() {
     );
 }
 
-/// The edges of the triangulation: no mesh made of it has others.
+/// The edges of the triangulation: a mesh of its facets has no others.
 fn possible(points: &[DVec3]) -> HashSet<(u32, u32)> {
     let delaunay = Delaunay::new(points).expect("a body");
     let source = |v: u32| {
@@ -246,20 +246,21 @@ fn possible(points: &[DVec3]) -> HashSet<(u32, u32)> {
         .collect()
 }
 
-/// The edges of a mesh as pairs of input points, the lower first, and for every point those it has edges to.
-fn edges_of(made: &Mesh) -> (HashSet<(u32, u32)>, HashMap<u32, Vec<u32>>) {
-    let source = |v: u32| made.sources[v as usize];
-    let edges: HashSet<(u32, u32)> = (made.triangles.iter())
-        .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
-        .map(|(a, b)| (source(a), source(b)))
-        .map(|(a, b)| (a.min(b), a.max(b)))
-        .collect();
+/// For every input point those that the mesh has edges to.
+fn beside(made: &Mesh) -> HashMap<u32, Vec<u32>> {
     let mut beside: HashMap<u32, Vec<u32>> = HashMap::new();
-    for (a, b) in &edges {
-        beside.entry(*a).or_default().push(*b);
-        beside.entry(*b).or_default().push(*a);
+    // An edge has two triangles, and each goes along it one way.
+    for t in &made.triangles {
+        for (a, b) in [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])] {
+            let [a, b] = [a, b].map(|v| made.sources[v as usize]);
+            beside.entry(a).or_default().push(b);
+        }
     }
-    (edges, beside)
+    beside
+}
+
+fn is_edge(beside: &HashMap<u32, Vec<u32>>, (a, b): (u32, u32)) -> bool {
+    beside.get(&a).is_some_and(|others| others.contains(&b))
 }
 
 /// Whether edges of the mesh lead from one point to another over points for which `is_near` holds.
@@ -286,7 +287,7 @@ fn follows(
 /// A link that the mesh lacks is followed where its edges lead there over points that lie within 3 % of a spacing of the true edge: points of the faces
 /// beside it. Off the surface is a triangle whose centre is farther from it than that.
 fn links(made: &Mesh, sampled: &clouds::Sampled, solid: &clouds::Solid) {
-    let (edges, beside) = edges_of(made);
+    let beside = beside(made);
     let possible = possible(&sampled.points);
     let near = 0.03 * sampled.spacing;
     let on_edge = sampled.on_edge.iter().filter(|o| **o).count() as u32;
@@ -298,9 +299,10 @@ fn links(made: &Mesh, sampled: &clouds::Sampled, solid: &clouds::Solid) {
         sampled.edges.iter().any(is_on)
     };
     let all: Vec<(u32, u32)> = (1..on_edge).filter(along).map(|i| (i - 1, i)).collect();
-    let found = all.iter().filter(|l| edges.contains(l)).count();
+    let found = all.iter().filter(|l| is_edge(&beside, **l)).count();
     let most = all.iter().filter(|l| possible.contains(l)).count();
-    let followed = (all.iter()).filter(|l| !edges.contains(l) && follows(&beside, **l, is_near));
+    let followed =
+        (all.iter()).filter(|l| !is_edge(&beside, **l) && follows(&beside, **l, is_near));
     let followed = followed.count();
     let is_off = |t: &&[u32; 3]| {
         let [a, b, c] = t.map(|v| made.positions[v as usize]);
@@ -496,13 +498,13 @@ fn sharp() {
         let most = edges.iter().filter(|e| possible.contains(e)).count();
         for cone in [false, true] {
             let made = mesh(&points, Settings { cone, open: false }).expect("a body");
-            let (has, beside) = edges_of(&made);
-            let found = edges.iter().filter(|e| has.contains(e)).count();
+            let beside = beside(&made);
+            let found = edges.iter().filter(|e| is_edge(&beside, **e)).count();
             let is_followed = |e: &&(u32, u32)| {
                 let [a, b] = [e.0, e.1].map(|i| points[i as usize]);
                 let line = Line::Segment(a, b);
                 let near = 0.001 * a.distance(b);
-                !has.contains(e)
+                !is_edge(&beside, **e)
                     && follows(&beside, **e, |i| line.distance(points[i as usize]) < near)
             };
             let followed = edges.iter().filter(is_followed).count();

@@ -178,20 +178,23 @@ impl<'a> Surface<'a> {
         is_sharp(half) || self.rim(half).into_iter().any(is_sharp)
     }
 
-    /// Sums of the bends at an edge and its rim, as they are and with the other diagonal.
-    fn bends(&self, half: u32) -> (f64, f64) {
+    /// Sum of the bends at an edge and its rim, as they are or with the `other` diagonal.
+    fn bends(&self, half: u32, other: bool) -> f64 {
         let [a, b, c, d] = self.corners(half).map(|v| self.at(v));
-        let (mut before, mut after) = (bend(a, b, c, d), bend(c, d, b, a));
         let ends = [(b, c, a, d), (c, a, b, d), (a, d, b, c), (d, b, a, c)];
+        let mut sum = if other {
+            bend(c, d, b, a)
+        } else {
+            bend(a, b, c, d)
+        };
         for (h, (from, to, now, then)) in self.rim(half).into_iter().zip(ends) {
             let twin = self.twin(h);
             if twin != NONE {
-                let beyond = self.at(self.apex(twin));
-                before += bend(from, to, now, beyond);
-                after += bend(from, to, then, beyond);
+                let third = if other { then } else { now };
+                sum += bend(from, to, third, self.at(self.apex(twin)));
             }
         }
-        (before, after)
+        sum
     }
 
     fn entry(&self, half: u32) -> Option<Entry> {
@@ -200,8 +203,8 @@ impl<'a> Surface<'a> {
             return None;
         }
         let half = half.min(twin);
-        let (before, after) = self.bends(half);
-        let gain = before - after;
+        let before = self.bends(half, false);
+        let gain = before - self.bends(half, true);
         (gain > LEAST_GAIN * before).then(|| Entry {
             gain,
             ends: self.ends(half),
@@ -387,7 +390,7 @@ impl<'a> Surface<'a> {
     }
 
     fn try_together(&mut self, half: u32, steps: &mut Vec<Step>) -> bool {
-        let (all, _) = self.bends(half);
+        let all = self.bends(half, false);
         self.follow(half, (all, 0.0), steps)
     }
 
@@ -396,10 +399,16 @@ impl<'a> Surface<'a> {
         if self.twin(half) == NONE {
             return false;
         }
-        let (before, after) = self.bends(half);
-        let gained = gained + before - after;
+        let is_last = steps.len() + 1 == MOST_STEPS;
+        let least = if is_last { LEAST_GAIN } else { -MOST_LOSS } * all;
+        // At the best the other diagonal leaves no bend.
+        let most = gained + self.bends(half, false);
+        if most <= least {
+            return false;
+        }
+        let gained = most - self.bends(half, true);
         let gains = gained > LEAST_GAIN * all;
-        let may_go_on = steps.len() + 1 < MOST_STEPS && gained >= -MOST_LOSS * all;
+        let may_go_on = !is_last && gained >= least;
         if !(gains || may_go_on) || !self.is_whole(half) {
             return false;
         }
@@ -534,12 +543,14 @@ mod tests {
         let half = 4 * 2 + 1;
         assert_eq!(surface.ends(half), (4, 6));
         assert!(surface.is_whole(half) && surface.is_free(half));
-        let (before, after) = surface.bends(half);
+        let bends = [false, true].map(|other| surface.bends(half, other));
         let twins = surface.twins.clone();
         let step = surface.step(half);
         surface.swap(half);
         assert_eq!(surface.ends(half & !3), (5, 7));
-        assert_eq!(surface.bends(half & !3), (after, before));
+        let turned = [true, false].map(|other| surface.bends(half & !3, other));
+        // The same in another order.
+        assert!((0..2).all(|i| (bends[i] - turned[i]).abs() < 1e-12));
         let made = crate::mesh::topology(8, &surface.triangles);
         assert!(made.is_watertight() && made.is_manifold());
         assert_eq!(super::twins(&surface.triangles), surface.twins);
