@@ -6,7 +6,7 @@
 
 #![allow(clippy::print_stdout)]
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::time::Instant;
 
 use acies::mesh::{Body, Delaunay, Mesh, Rings, Settings, check_delaunay, mesh, normals, picture};
@@ -227,7 +227,7 @@ fn table52() {
     );
 }
 
-/// The edges of the triangulation: no mesh made of it has others.
+/// The edges of the triangulation: a mesh of its facets has no others.
 fn possible(points: &[DVec3]) -> HashSet<(u32, u32)> {
     let delaunay = Delaunay::new(points).expect("a body");
     let source = |v: u32| {
@@ -246,39 +246,76 @@ fn possible(points: &[DVec3]) -> HashSet<(u32, u32)> {
         .collect()
 }
 
-/// Links along true edges, for clouds whose points on edges come first and in order.
+/// For every input point those that the mesh has edges to.
+fn beside(made: &Mesh) -> HashMap<u32, Vec<u32>> {
+    let mut beside: HashMap<u32, Vec<u32>> = HashMap::new();
+    // An edge has two triangles, and each goes along it one way.
+    for t in &made.triangles {
+        for (a, b) in [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])] {
+            let [a, b] = [a, b].map(|v| made.sources[v as usize]);
+            beside.entry(a).or_default().push(b);
+        }
+    }
+    beside
+}
+
+fn is_edge(beside: &HashMap<u32, Vec<u32>>, (a, b): (u32, u32)) -> bool {
+    beside.get(&a).is_some_and(|others| others.contains(&b))
+}
+
+/// Whether edges of the mesh lead from one point to another over points for which `is_near` holds.
+fn follows(
+    beside: &HashMap<u32, Vec<u32>>,
+    (from, to): (u32, u32),
+    is_near: impl Fn(u32) -> bool,
+) -> bool {
+    let mut reached = vec![from];
+    let mut at = 0;
+    while at < reached.len() && !reached.contains(&to) {
+        for next in beside.get(&reached[at]).into_iter().flatten() {
+            if !reached.contains(next) && (*next == to || is_near(*next)) {
+                reached.push(*next);
+            }
+        }
+        at += 1;
+    }
+    reached.contains(&to)
+}
+
+/// Links along true edges, for clouds whose points on edges come first and in order, and triangles off the surface.
 ///
-/// Where a point of a face lies too near an edge the link there is no edge of the Delaunay triangulation, and no mesh made of it can have it.
-fn links(made: &Mesh, sampled: &clouds::Sampled) {
-    let ordered = |a: u32, b: u32| (a.min(b), a.max(b));
-    let edges: HashSet<(u32, u32)> = (made.triangles.iter())
-        .flat_map(|t| {
-            [
-                ordered(t[0], t[1]),
-                ordered(t[1], t[2]),
-                ordered(t[2], t[0]),
-            ]
-        })
-        .collect();
+/// A link that the mesh lacks is followed where its edges lead there over points that lie within 3 % of a spacing of the true edge: points of the faces
+/// beside it. Off the surface is a triangle whose centre is farther from it than that.
+fn links(made: &Mesh, sampled: &clouds::Sampled, solid: &clouds::Solid) {
+    let beside = beside(made);
     let possible = possible(&sampled.points);
+    let near = 0.03 * sampled.spacing;
     let on_edge = sampled.on_edge.iter().filter(|o| **o).count() as u32;
+    let point = |i: u32| sampled.points[i as usize];
+    let is_near = |i: u32| sampled.edges.iter().any(|l| l.distance(point(i)) < near);
     let along = |i: &u32| {
-        let [a, b] = [*i - 1, *i].map(|i| sampled.points[i as usize]);
         // Made there; rounding only.
-        let is_on = |l: &Line| l.distance(a) < 1e-9 && l.distance(b) < 1e-9;
+        let is_on = |l: &Line| l.distance(point(*i - 1)) < 1e-9 && l.distance(point(*i)) < 1e-9;
         sampled.edges.iter().any(is_on)
     };
-    let all: Vec<u32> = (1..on_edge).filter(along).collect();
-    let found = all
-        .iter()
-        .filter(|i| edges.contains(&(**i - 1, **i)))
-        .count();
-    let most = all
-        .iter()
-        .filter(|i| possible.contains(&(**i - 1, **i)))
-        .count();
+    let all: Vec<(u32, u32)> = (1..on_edge).filter(along).map(|i| (i - 1, i)).collect();
+    let found = all.iter().filter(|l| is_edge(&beside, **l)).count();
+    let most = all.iter().filter(|l| possible.contains(l)).count();
+    let followed =
+        (all.iter()).filter(|l| !is_edge(&beside, **l) && follows(&beside, **l, is_near));
+    let followed = followed.count();
+    let is_off = |t: &&[u32; 3]| {
+        let [a, b, c] = t.map(|v| made.positions[v as usize]);
+        let (n, centre) = ((b - a).cross(c - a).normalize_or_zero(), (a + b + c) / 3.0);
+        let meets = |way: DVec3| {
+            let mut hits = (solid.faces.iter()).filter_map(|f| f.hit(centre - way * near, way));
+            hits.any(|(t, _)| t < 2.0 * near)
+        };
+        ![n, DVec3::X, DVec3::Y, DVec3::Z].into_iter().any(meets)
+    };
+    let off = made.triangles.iter().filter(is_off).count();
     println!(
-        "    {found} of {} links along the true edges; {most} are in the triangulation",
+        "    {found} of {} links along the true edges, {followed} of the others are followed; {most} are in the triangulation; {off} triangles off the surface",
         all.len()
     );
 }
@@ -287,22 +324,19 @@ fn peers() {
     println!("\npeers.md: best of them leaves these open or incomplete");
     head();
     let settings = Settings::default();
-    for (name, sampled, genus) in [
-        ("cube 10,250", solids::cube(10.0).even(10_250, 580), 0),
-        (
-            "hole 17,400",
-            solids::cube_with_hole(10.0).even(17_400, 839),
-            1,
-        ),
-        (
-            "hole 58,720",
-            solids::cube_with_hole(10.0).even(58_720, 1_350),
-            1,
-        ),
+    let (cube, hole) = (solids::cube(10.0), solids::cube_with_hole(10.0));
+    for (name, solid, counts, genus) in [
+        ("cube 10,250", &cube, (10_250, 580), 0),
+        ("hole 17,400", &hole, (17_400, 839), 1),
+        ("hole 58,720", &hole, (58_720, 1_350), 1),
     ] {
+        let sampled = solid.even(counts.0, counts.1);
         let made = row(name, &sampled.points, genus, settings);
-        links(&made, &sampled);
+        links(&made, &sampled, solid);
     }
+    let block = solids::block().sample(40_000, 0.0, 1);
+    let made = row("block 40,000 at random", &block.points, 2, settings);
+    links(&made, &block, &solids::block());
     for percent in [0.4, 0.8, 1.2, 2.0] {
         let clean = solids::cube_with_hole(10.0).even(17_400, 839);
         let reach = percent / 100.0 * 8.5 / 0.25 * clean.spacing;
@@ -443,6 +477,8 @@ fn cube_866() -> bodies::Known {
     known
 }
 
+/// Sides of needles no higher than the rounding of their points are marked as sharp too: a mesh without the needle has the points between as corners, and its
+/// edges follow the side within a thousandth of its length.
 fn sharp() {
     println!(
         "\nsharp edges of the model that are edges of the mesh; aim 99.5 % with the cone filter and the exchange of diagonals"
@@ -462,14 +498,18 @@ fn sharp() {
         let most = edges.iter().filter(|e| possible.contains(e)).count();
         for cone in [false, true] {
             let made = mesh(&points, Settings { cone, open: false }).expect("a body");
-            let has: HashSet<(u32, u32)> = (made.triangles.iter())
-                .flat_map(|t| [(t[0], t[1]), (t[1], t[2]), (t[2], t[0])])
-                .map(|(a, b)| (made.sources[a as usize], made.sources[b as usize]))
-                .map(|(a, b)| (a.min(b), a.max(b)))
-                .collect();
-            let found = edges.iter().filter(|e| has.contains(e)).count();
+            let beside = beside(&made);
+            let found = edges.iter().filter(|e| is_edge(&beside, **e)).count();
+            let is_followed = |e: &&(u32, u32)| {
+                let [a, b] = [e.0, e.1].map(|i| points[i as usize]);
+                let line = Line::Segment(a, b);
+                let near = 0.001 * a.distance(b);
+                !is_edge(&beside, **e)
+                    && follows(&beside, **e, |i| line.distance(points[i as usize]) < near)
+            };
+            let followed = edges.iter().filter(is_followed).count();
             println!(
-                "{name:22} cone {cone:5} {found:5} of {:5} {:6.2} % ({most} in the triangulation)  matched {:.2} %, genus {:?}, {:?}",
+                "{name:22} cone {cone:5} {found:5} of {:5} {:6.2} %, {followed} of the others followed ({most} in the triangulation)  matched {:.2} %, genus {:?}, {:?}",
                 edges.len(),
                 100.0 * found as f64 / edges.len() as f64,
                 made.matched_percent(),
@@ -486,7 +526,7 @@ fn labelled(name: &str) -> Option<(Vec<DVec3>, Edges)> {
         .join("../shared/data/sharp-labels")
         .join(name);
     let text = std::fs::read_to_string(path).ok()?;
-    let mut numbers = std::collections::HashMap::new();
+    let mut numbers = HashMap::new();
     let (mut points, mut edges) = (Vec::new(), Vec::new());
     for line in text.lines() {
         let words: Vec<&str> = line.split_whitespace().collect();
@@ -586,7 +626,7 @@ fn open_row(
             parent[i.max(j) as usize] = i.min(j);
         }
     }
-    let mut sizes = std::collections::HashMap::new();
+    let mut sizes = HashMap::new();
     for triangle in &made.triangles {
         *sizes
             .entry(root(&mut parent, triangle[0]))

@@ -3,29 +3,32 @@
 //! The way of Ma 2011: the Delaunay triangulation of the points; around every point an umbrella of its facets; umbrellas picked again until
 //! neighbours pick the same. What does not come to match is decided by the cells: every umbrella votes which of its cells are inside, the
 //! cheapest parting of all cells follows the votes without wide facets, and cells are turned until the surface between inside and outside is a
-//! manifold through every point.
+//! manifold through every point. At last diagonals are exchanged until the edges of the mesh lie along those of the part.
 
+mod boxes;
 mod build;
 mod carve;
 pub mod check;
 mod cone;
+mod crossing;
 mod curve;
 mod cut;
 mod defect;
 pub mod delaunay;
+mod flip;
 pub mod mend;
 pub mod normals;
 mod open;
 mod part;
 pub mod picture;
 mod predicates;
-pub mod sharpen;
 mod sheet;
 pub mod solid;
 pub mod star;
 pub mod umbrella;
 pub mod write;
 
+use std::borrow::Cow;
 use std::time::Instant;
 
 use glam::DVec3;
@@ -123,6 +126,11 @@ pub struct Body {
     pub matching: Matching,
     /// How vertices were mended.
     pub mending: Mending,
+    /// Triangles of the closed surface, counter-clockwise seen from outside: those between inside and outside, of which diagonals were exchanged. Empty
+    /// where the mesh shall be open.
+    pub surface: Vec<[u32; 3]>,
+    /// Vertices that the surface has once more, numbered behind those of the triangulation: where it comes together twice it is parted.
+    pub copies: Vec<u32>,
     /// Seconds by stage.
     pub seconds: Vec<(&'static str, f64)>,
 }
@@ -154,10 +162,22 @@ impl Body {
         // What closes an open scan is thrown away again: cells as large as the part, at vertices of thousands.
         let mending = mend(&delaunay, &stars, &facets, &mut solid, !settings.open);
         lap("mend");
-        if settings.cone && !settings.open {
-            sharpen::sharpen(&delaunay, &stars, &mut solid.inside);
+        let (mut triangles, mut copies) = (Vec::new(), Vec::new());
+        if !settings.open {
+            triangles = surface(&delaunay, &solid.inside);
+            if mending.after > 0 {
+                copies = part::part(&delaunay, &solid.inside, &mut triangles);
+            }
+            if settings.cone {
+                let mut points = Cow::Borrowed(&delaunay.points[..]);
+                if !copies.is_empty() {
+                    let again = copies.iter().map(|v| delaunay.points[*v as usize]);
+                    points.to_mut().extend(again);
+                }
+                flip::flip(&points, &mut triangles);
+            }
         }
-        lap("sharpen");
+        lap("flip");
         Ok(Self {
             delaunay,
             stars,
@@ -165,6 +185,8 @@ impl Body {
             solid,
             matching,
             mending,
+            surface: triangles,
+            copies,
             seconds,
         })
     }
@@ -178,17 +200,15 @@ impl Body {
             // Every source is in the list it was copied to.
             .map(|s| sources.partition_point(|other| other < s) as u32)
             .collect();
-        let mut triangles = if settings.open {
+        let triangles = if settings.open {
             open::seen_triangles(self)
         } else {
-            surface(&self.delaunay, &self.solid.inside)
-        };
-        if !settings.open && self.mending.after > 0 {
-            for v in part::part(&self.delaunay, &self.solid.inside, &mut triangles) {
+            for v in &self.copies {
                 numbers.push(sources.len() as u32);
-                sources.push(self.delaunay.sources[v as usize]);
+                sources.push(self.delaunay.sources[*v as usize]);
             }
-        }
+            self.surface.clone()
+        };
         let triangles = numbered(triangles, &numbers);
         let mut seconds = self.seconds.clone();
         seconds.push(("surface", start.elapsed().as_secs_f64()));

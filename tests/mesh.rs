@@ -15,6 +15,8 @@ use proptest::prelude::*;
 #[path = "mesh/bodies.rs"]
 mod bodies;
 mod clouds;
+#[path = "mesh/embedded.rs"]
+mod embedded;
 
 use clouds::score::cloud;
 use clouds::solids::{self, Hole, extrusion};
@@ -225,6 +227,38 @@ proptest! {
         points.reverse();
         let other = Delaunay::new(&points).expect("the same points");
         prop_assert_eq!(cells(&delaunay), cells(&other));
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(48))]
+
+    #[test]
+    fn no_mesh_crosses_itself(
+        raw in proptest::collection::vec((-1.0f64..1.0, -1.0f64..1.0, -1.0f64..1.0, 0.0f64..1.0), 6..90),
+        kind in 0usize..4,
+        steps in 3.0f64..400.0,
+    ) {
+        // Whole numbers on a ball, on a box, on both with noise, anywhere.
+        let points: Vec<DVec3> = (raw.iter())
+            .map(|(x, y, z, depth)| (DVec3::new(*x, *y, *z), depth))
+            .map(|(p, depth)| match kind {
+                0 => p.normalize_or_zero(),
+                1 => p / p.abs().max_element(),
+                2 => p.normalize_or_zero() * (1.0 - 0.1 * depth),
+                _ => p,
+            })
+            .map(|p| (p * steps).round())
+            .collect();
+        let Ok(made) = mesh(&points, Settings::default()) else { return Ok(()) };
+        let whole = |v: u32| made.positions[v as usize].to_array().map(|x| x as i128);
+        let triangles: Vec<[embedded::Point; 3]> =
+            made.triangles.iter().map(|t| t.map(whole)).collect();
+        for (i, s) in triangles.iter().enumerate() {
+            for t in &triangles[..i] {
+                prop_assert!(!embedded::cross_one_another(*s, *t), "{:?} and {:?}", s, t);
+            }
+        }
     }
 }
 
@@ -553,6 +587,50 @@ fn noise_chooses_the_rings() {
             assert!(own < bodies::errors(&planes, &clean.normals)[0]);
         }
     }
+}
+
+#[test]
+fn an_edge_that_the_triangulation_lacks_is_an_edge_of_the_mesh() {
+    // An angle whose inner edge has points of both faces so near that no empty ball goes through two points of the edge.
+    let (legs, thick, near) = (6i32, 2i32, 1.0 / 64.0);
+    let is_in = |x: i32, z: i32| {
+        let around = [(x - 1, z - 1), (x - 1, z), (x, z - 1), (x, z)];
+        let cells = around.map(|(x, z)| {
+            (0..legs).contains(&x) && (0..legs).contains(&z) && (x < thick || z < thick)
+        });
+        (cells.contains(&true), cells.contains(&false))
+    };
+    let mut points = Vec::new();
+    for (x, z) in (0..=legs).flat_map(|x| (0..=legs).map(move |z| (x, z))) {
+        for y in 0..=8 {
+            let (inside, outside) = is_in(x, z);
+            if inside && (outside || y == 0 || y == 8) {
+                points.push(DVec3::new(f64::from(x), f64::from(y), f64::from(z)));
+            }
+        }
+    }
+    let inner = f64::from(thick);
+    for y in 0..8 {
+        let along = f64::from(y) + 0.5;
+        points.push(DVec3::new(inner + near, along, inner));
+        points.push(DVec3::new(inner, along, inner + near));
+    }
+    let place = |p: DVec3| points.iter().position(|q| *q == p).expect("made") as u32;
+    let links: Vec<(u32, u32)> = (0..8)
+        .map(|y| [y, y + 1].map(|y| place(DVec3::new(inner, f64::from(y), inner))))
+        .map(|[a, b]| (a.min(b), a.max(b)))
+        .collect();
+    let delaunay = triangulated(&points);
+    let is_there = |(a, b): &&(u32, u32)| {
+        let [a, b] = [*a, *b].map(|i| delaunay.vertex_of[i as usize]);
+        (delaunay.cells.iter()).any(|c| c.contains(&a) && c.contains(&b))
+    };
+    assert_eq!(links.iter().filter(is_there).count(), 0);
+    let made = closed("angle", &points, 0);
+    assert_eq!(kept(&made, &links), (8, 8));
+    // The faces are met exactly.
+    let exact = f64::from(8 * (2 * legs * thick - thick * thick));
+    assert!((volume(&made) - exact).abs() < 1e-9, "{}", volume(&made));
 }
 
 #[test]

@@ -4,9 +4,7 @@ use glam::{DVec3, Vec3};
 use rayon::prelude::*;
 
 use super::Body;
-use super::delaunay::{FACETS, GHOST};
 use super::solid::Senses;
-use super::star::{corner, facet};
 use crate::geometry::fit::NormalSums;
 use crate::points::{Neighbors, PointCloud, noise_mm, spacing};
 use crate::surface::weighted_plane_normals;
@@ -46,8 +44,7 @@ const PLANE_NEIGHBOURS: usize = 40;
 /// The normals of the points of `cloud`, of which `body` was made.
 ///
 /// We differ: the thesis takes the facets of an umbrella whether its neighbours have them or not, weighted by matching index times angle (Ma
-/// 2011, equation 4.6), and a plane where fewer than three match. Here every vertex has the closed ring of the mesh; facets that
-/// matching alone found weigh their index, the others one. Where the surface turns smoothly and points are clean, that
+/// 2011, equation 4.6), and a plane where fewer than three match. Here every vertex has the closed ring of the mesh. Where the surface turns smoothly and points are clean, that
 /// normal is corrected by a cubic through two rings; under strong noise it is that of a quadric through three. The plane remains for points without triangles. Orientation needs no
 /// propagation: the body has an outside. How many rings follows from the noise of the points, not from the user.
 pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Rings) -> Normals {
@@ -63,28 +60,33 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
         chosen => chosen,
     };
     let count = body.delaunay.points.len() as u32;
+    let around = Around::new(body);
     let one: Vec<DVec3> = (0..count)
         .into_par_iter()
-        .map(|v| ring_sum(body, v).normalize_or_zero())
+        .map(|v| ring_sum(&around, v).normalize_or_zero())
         .collect();
     let of_vertex: Vec<Vec3> = match rings {
         Rings::Two => (0..count)
             .into_par_iter()
-            .map(|v| two_rings(body, v, &one).as_vec3())
+            .map(|v| two_rings(&around, v, &one).as_vec3())
             .collect(),
         Rings::Three => {
             let two: Vec<DVec3> = (0..count)
                 .into_par_iter()
-                .map(|v| two_rings(body, v, &one))
+                .map(|v| two_rings(&around, v, &one))
                 .collect();
             (0..count)
                 .into_par_iter()
-                .map(|v| quadric(body, v, &two).unwrap_or(two[v as usize]).as_vec3())
+                .map(|v| {
+                    quadric(&around, v, &two)
+                        .unwrap_or(two[v as usize])
+                        .as_vec3()
+                })
                 .collect()
         }
         _ => (0..count)
             .into_par_iter()
-            .map(|v| cubic(body, v, &one).unwrap_or(one[v as usize]).as_vec3())
+            .map(|v| cubic(&around, v, &one).unwrap_or(one[v as usize]).as_vec3())
             .collect(),
     };
     let mut normals: Vec<Vec3> = (body.delaunay.vertex_of.iter())
@@ -108,51 +110,79 @@ pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Ri
     }
 }
 
-/// Calls `with` for every triangle of the surface at `v`: its outward normal (twice the area long), other corners, and facet.
-fn triangles_at(body: &Body, v: u32, mut with: impl FnMut(DVec3, [u32; 2], u32)) {
-    let delaunay = &body.delaunay;
-    for code in body.stars.of(v) {
-        let (cell, own) = corner(*code);
-        if !body.solid.inside[cell as usize] {
-            continue;
+/// The triangles of the surface at every vertex of the triangulation.
+struct Around<'a> {
+    body: &'a Body,
+    starts: Vec<u32>,
+    /// Three times the triangle plus the place of the vertex.
+    corners: Vec<u32>,
+}
+
+impl<'a> Around<'a> {
+    fn new(body: &'a Body) -> Self {
+        let count = body.delaunay.points.len();
+        let mut around = Self {
+            body,
+            starts: vec![0; count + 2],
+            corners: vec![0; 3 * body.surface.len()],
+        };
+        let vertices = || body.surface.iter().flatten().map(|v| vertex(body, *v));
+        for v in vertices() {
+            around.starts[v as usize + 2] += 1;
         }
-        for at in (0..4).filter(|at| *at != own) {
-            if body.solid.inside[delaunay.neighbors[cell as usize][at] as usize] {
-                continue;
-            }
-            let corners = FACETS[at].map(|k| delaunay.cells[cell as usize][k]);
-            debug_assert!(!corners.contains(&GHOST));
-            let [a, b, c] = corners.map(|u| delaunay.points[u as usize]);
-            let normal = (b - a).cross(c - a);
-            let at_v = corners.iter().position(|u| *u == v).unwrap_or(0);
-            let others = [corners[(at_v + 1) % 3], corners[(at_v + 2) % 3]];
-            with(normal, others, facet(delaunay, cell, at));
+        for v in 0..count {
+            around.starts[v + 2] += around.starts[v + 1];
         }
+        for (corner, v) in vertices().enumerate() {
+            let at = &mut around.starts[v as usize + 1];
+            around.corners[*at as usize] = corner as u32;
+            *at += 1;
+        }
+        around
+    }
+
+    fn at(&self, v: u32) -> DVec3 {
+        self.body.delaunay.points[v as usize]
+    }
+
+    /// Outward normal (twice the area long) and other corners of every triangle at `v`.
+    fn triangles(&self, v: u32) -> impl Iterator<Item = (DVec3, [u32; 2])> {
+        let corners = self.starts[v as usize] as usize..self.starts[v as usize + 1] as usize;
+        self.corners[corners].iter().map(move |corner| {
+            let triangle = self.body.surface[(corner / 3) as usize];
+            let k = (corner % 3) as usize;
+            let others = [1, 2].map(|i| vertex(self.body, triangle[(k + i) % 3]));
+            let [b, c] = others.map(|u| self.at(u) - self.at(v));
+            (b.cross(c), others)
+        })
     }
 }
 
-/// Outward normals of the triangles at `v`, weighted by matching index times area.
+/// The vertex of the triangulation that a vertex of the surface is, or is a copy of.
+fn vertex(body: &Body, v: u32) -> u32 {
+    let count = body.delaunay.points.len();
+    (v as usize)
+        .checked_sub(count)
+        .map_or(v, |i| body.copies[i])
+}
+
+/// Outward normals of the triangles at `v`, weighted by area.
 ///
 /// We differ: the thesis weighs by angle (Ma 2011, equation 4.6); on a torus, where normals are known, areas leave half of its error.
-fn ring_sum(body: &Body, v: u32) -> DVec3 {
-    let mut sum = DVec3::ZERO;
-    triangles_at(body, v, |normal, _, facet| {
-        sum += normal * f64::from(body.facets.matches(facet).max(1));
-    });
-    sum
+fn ring_sum(around: &Around, v: u32) -> DVec3 {
+    around.triangles(v).map(|(normal, _)| normal).sum()
 }
 
 /// The normal of the cubic height function through `v` and the corners of both rings, or none where the surface does not turn smoothly there.
-fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
+fn cubic(surface: &Around, v: u32, one: &[DVec3]) -> Option<DVec3> {
     /// One more than coefficients.
     const LEAST_POINTS: usize = 14;
     /// Slopes above this are no correction of the normal but another surface.
     const STEEPEST: f64 = 0.3;
     let own = one[v as usize];
-    let mut around = Vec::new();
-    triangles_at(body, v, |_, others, _| around.extend(others));
+    let mut around: Vec<u32> = surface.triangles(v).flat_map(|t| t.1).collect();
     for i in 0..around.len() {
-        triangles_at(body, around[i], |_, others, _| around.extend(others));
+        around.extend(surface.triangles(around[i]).flat_map(|t| t.1));
     }
     around.sort_unstable();
     around.dedup();
@@ -163,13 +193,10 @@ fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
     if around.len() < LEAST_POINTS || !is_smooth {
         return None;
     }
-    let p = body.delaunay.points[v as usize];
+    let p = surface.at(v);
     let x = own.any_orthonormal_vector();
     let y = own.cross(x);
-    let ways: Vec<DVec3> = around
-        .iter()
-        .map(|u| body.delaunay.points[*u as usize] - p)
-        .collect();
+    let ways: Vec<DVec3> = around.iter().map(|u| surface.at(*u) - p).collect();
     let reach = ways.iter().map(|d| d.length()).fold(0.0, f64::max);
     let mut sums = NormalSums::<9>::default();
     for d in &ways {
@@ -195,19 +222,19 @@ fn cubic(body: &Body, v: u32, one: &[DVec3]) -> Option<DVec3> {
 }
 
 /// The triangles of both rings weighted by area, those beyond an edge left out.
-fn two_rings(body: &Body, v: u32, one: &[DVec3]) -> DVec3 {
+fn two_rings(surface: &Around, v: u32, one: &[DVec3]) -> DVec3 {
     let own = one[v as usize];
     let mut around = vec![v];
-    triangles_at(body, v, |_, others, _| around.extend(others));
+    around.extend(surface.triangles(v).flat_map(|t| t.1));
     around.sort_unstable();
     around.dedup();
     let mut sum = DVec3::ZERO;
     for u in around {
-        triangles_at(body, u, |normal, _, _| {
+        for (normal, _) in surface.triangles(u) {
             if normal.normalize_or_zero().dot(own) > BEYOND_EDGE {
                 sum += normal;
             }
-        });
+        }
     }
     sum.try_normalize().unwrap_or(own)
 }
@@ -218,7 +245,7 @@ fn two_rings(body: &Body, v: u32, one: &[DVec3]) -> DVec3 {
 /// We differ: the thesis takes triangles of two rings under noise and still falls behind planes through neighbours where it is strong (Ma 2011,
 /// figures 4.11 and 4.12); the rings of the mesh keep apart what lies on two sides of a wall or an edge, and the fit averages as
 /// many points as planes do.
-fn quadric(body: &Body, v: u32, two: &[DVec3]) -> Option<DVec3> {
+fn quadric(surface: &Around, v: u32, two: &[DVec3]) -> Option<DVec3> {
     const LEAST_POINTS: usize = 12;
     const RINGS: usize = 3;
     let own = two[v as usize];
@@ -227,23 +254,21 @@ fn quadric(body: &Body, v: u32, two: &[DVec3]) -> Option<DVec3> {
     for _ in 0..RINGS {
         let reached = around.len();
         for i in done..reached {
-            triangles_at(body, around[i], |_, others, _| {
-                for u in others {
-                    if two[u as usize].dot(own) > BEYOND_EDGE && !around.contains(&u) {
-                        around.push(u);
-                    }
+            for u in surface.triangles(around[i]).flat_map(|t| t.1) {
+                if two[u as usize].dot(own) > BEYOND_EDGE && !around.contains(&u) {
+                    around.push(u);
                 }
-            });
+            }
         }
         done = reached;
     }
     if around.len() < LEAST_POINTS {
         return None;
     }
-    let p = body.delaunay.points[v as usize];
+    let p = surface.at(v);
     let x = own.any_orthonormal_vector();
     let y = own.cross(x);
-    let ways = around.iter().map(|u| body.delaunay.points[*u as usize] - p);
+    let ways = around.iter().map(|u| surface.at(*u) - p);
     let reach = ways.clone().map(|d| d.length()).fold(0.0, f64::max);
     let mut sums = NormalSums::<6>::default();
     for d in ways {
