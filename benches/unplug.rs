@@ -48,7 +48,14 @@ fn main() {
                 Phase::Aborted => aborted += 1,
                 _ => other += 1,
             }
-            named += u32::from(inspection.reason.contains(&format!("{name:?}")));
+            if inspection.reason.contains(&format!("{name:?}")) {
+                named += 1;
+            } else {
+                println!(
+                    "    {name}-{round}: {:?}: {}",
+                    inspection.phase, inspection.reason
+                );
+            }
             played.plug(&demo, device);
             let began = Instant::now();
             running.until("ready again", |s| s.state == State::Ready);
