@@ -39,7 +39,8 @@ pub fn overlap(signs: &Signs, (own, p): &Corners, (other, q): &Corners) -> bool 
 pub fn touches(signs: &Signs, [p, q]: [DVec3; 2], triangle: &[DVec3; 3]) -> bool {
     let [a, b, c] = *triangle;
     let (from, to) = (signs.orient(a, b, c, p), signs.orient(a, b, c, q));
-    if from * to > 0.0 || (from > 0.0 && to > 0.0) || (from < 0.0 && to < 0.0) {
+    // Signs, not a product: that of two small volumes is zero.
+    if (from > 0.0 && to > 0.0) || (from < 0.0 && to < 0.0) {
         return false;
     }
     if from == 0.0 && to == 0.0 {

@@ -44,8 +44,8 @@ const PLANE_NEIGHBOURS: usize = 40;
 /// The normals of the points of `cloud`, of which `body` was made.
 ///
 /// We differ: the thesis takes the facets of an umbrella whether its neighbours have them or not, weighted by matching index times angle (Ma
-/// 2011, equation 4.6), and a plane where fewer than three match. Here every vertex has the closed ring of the mesh. Where the surface turns smoothly and points are clean, that
-/// normal is corrected by a cubic through two rings; under strong noise it is that of a quadric through three. The plane remains for points without triangles. Orientation needs no
+/// 2011, equation 4.6), and a plane where fewer than three match. Here every vertex has the closed ring of the mesh. Where the surface
+/// turns smoothly and points are clean, that normal is corrected by a cubic through two rings; under strong noise it is that of a quadric through three. The plane remains for points without triangles. Orientation needs no
 /// propagation: the body has an outside. How many rings follows from the noise of the points, not from the user.
 pub fn normals(body: &Body, cloud: &PointCloud, neighbors: &Neighbors, rings: Rings) -> Normals {
     let rings = match rings {
