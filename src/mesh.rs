@@ -5,6 +5,7 @@
 //! cheapest parting of all cells follows the votes without wide facets, and cells are turned until the surface between inside and outside is a
 //! manifold through every point. At last diagonals are exchanged until the edges of the mesh lie along those of the part.
 
+mod blocks;
 mod boxes;
 mod build;
 mod carve;
@@ -250,7 +251,7 @@ fn numbered(triangles: Vec<[u32; 3]>, numbers: &[u32]) -> Vec<[u32; 3]> {
 /// plane in the circle through the corners. So all signs stay exact and nothing is shaken.
 fn plane_mesh(positions: &[DVec3]) -> Result<Mesh, DelaunayError> {
     let start = Instant::now();
-    let (low, high) = curve::bounds(positions);
+    let (low, high) = curve::bounds(positions.iter().copied());
     let size = (high - low).max_element();
     // A plane holds two axes at the most.
     let off = |axis: DVec3| {

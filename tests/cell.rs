@@ -15,7 +15,9 @@ use acies::report::Report;
 use acies::report::wire::Status;
 use acies::store::{History, Inspection, Order, Phase, ScanReader, Store};
 use acies_drivers::capture::{Profile, Touch};
-use acies_drivers::device::{Claim, Identity, Instrument, Losses, Probe, Profiler, Setup};
+use acies_drivers::device::{
+    Claim, Identity, Instrument, Losses, Presence, Probe, Profiler, Setup,
+};
 use acies_drivers::error::DeviceError;
 use acies_drivers::link::Links;
 use acies_drivers::link::cable::Cable;
@@ -31,6 +33,8 @@ const PROFILES: u32 = 12;
 #[derive(Debug, Default)]
 struct Fate {
     absent: AtomicBool,
+    /// How often it was pulled and plugged in again: what was opened before is dead.
+    pulled: AtomicU32,
     /// The run is lost at this profile, once; 0 = never.
     lost_at: AtomicU32,
     /// The driver panics at this profile, once; 0 = never.
@@ -100,6 +104,7 @@ impl Setup for Played {
         let device = Device {
             identity,
             fate: self.fate.clone(),
+            pulled: self.fate.pulled.load(Ordering::Acquire),
             name: self.name,
             sent: 0,
             counted: false,
@@ -122,9 +127,19 @@ fn gone(name: &str) -> DeviceError {
 struct Device {
     identity: Identity,
     fate: Arc<Fate>,
+    pulled: u32,
     name: &'static str,
     sent: u32,
     counted: bool,
+}
+
+impl Device {
+    fn alive(&self) -> Result<(), DeviceError> {
+        match self.pulled == self.fate.pulled.load(Ordering::Acquire) {
+            true => Ok(()),
+            false => Err(gone(self.name)),
+        }
+    }
 }
 
 impl Profiler for Device {
@@ -133,6 +148,7 @@ impl Profiler for Device {
     }
 
     fn start(&mut self) -> Result<(), DeviceError> {
+        self.alive()?;
         (self.sent, self.counted) = (0, false);
         Ok(())
     }
@@ -187,6 +203,10 @@ impl Profiler for Device {
             received: u64::from(self.sent),
             ..Losses::default()
         }
+    }
+
+    fn check(&mut self) -> Result<Presence, DeviceError> {
+        self.alive().map(|()| Presence::Answered)
     }
 }
 
@@ -564,6 +584,35 @@ fn a_device_lost_in_mid_scan_aborts_the_part_and_comes_back_by_itself() {
         assert_eq!(bench.ended(id).phase, Phase::Done);
     }
     assert!(bench.right.opened.load(Ordering::Acquire) >= 4);
+}
+
+#[test]
+fn a_device_pulled_and_plugged_in_between_two_parts_costs_none() {
+    let bench = Bench::new("pulled");
+    bench.ready();
+    for round in 0..3 {
+        bench.left.pulled.fetch_add(1, Ordering::AcqRel);
+        let id = bench.start(&format!("A-{round}")).expect("taken").id;
+        assert_eq!(bench.ended(id).phase, Phase::Done);
+    }
+    assert!(bench.left.opened.load(Ordering::Acquire) >= 4);
+    // Pulled, and not back.
+    bench.left.absent.store(true, Ordering::Release);
+    bench.left.pulled.fetch_add(1, Ordering::AcqRel);
+    let id = bench.start("B").expect("nobody has noticed yet").id;
+    let aborted = bench.ended(id);
+    assert_eq!(aborted.phase, Phase::Aborted);
+    assert!(
+        (aborted.reason).starts_with("device \"left\" went away just now: left: no answer"),
+        "{}",
+        aborted.reason
+    );
+    bench.until("failed", |snapshot| snapshot.state == State::Error);
+    bench.left.absent.store(false, Ordering::Release);
+    bench.command(Command::Reset);
+    bench.ready();
+    let id = bench.start("C").expect("taken").id;
+    assert_eq!(bench.ended(id).phase, Phase::Done);
 }
 
 #[test]

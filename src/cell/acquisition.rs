@@ -13,7 +13,7 @@ use glam::DVec3;
 
 use super::CellError;
 use super::daemon::{Event, give_back};
-use super::devices::{self, Supervisor, chain, name_of};
+use super::devices::{self, Lent, Supervisor, chain, name_of};
 use super::job::{
     Acquired, Instruments, JobWatch, Part, Step, acquire, as_carrier, as_probe, as_profiler,
     step_of,
@@ -130,22 +130,31 @@ fn work(acquisition: &Acquisition, writer: &mut Writer) -> Result<Acquired, Cell
 /// Every device of the cell.
 fn borrow(acquisition: &Acquisition) -> Result<Instruments, CellError> {
     let cell = &acquisition.cell;
-    let mut lent: Vec<Option<Instrument>> = acquisition
+    // All of them look at once whether their device is still there.
+    let asked: Vec<_> = acquisition
         .supervisors
         .iter()
         .map(Supervisor::lend)
         .collect();
-    let missing = lent.iter().position(Option::is_none);
-    if let Some(index) = missing {
-        for (index, instrument) in lent.into_iter().enumerate() {
-            if instrument.is_some() {
-                give_back(&acquisition.supervisors, index, instrument);
+    let answers = asked.into_iter().map(|answered| match answered.recv() {
+        Ok(lent) => lent,
+        Err(_) => Err("the cell ends".to_owned()),
+    });
+    let answers: Vec<Lent> = answers.collect();
+    let whys = answers.iter().map(|lent| lent.as_ref().err().cloned());
+    let missing = whys.enumerate().find_map(|(i, why)| Some((i, why?)));
+    if let Some((missing, why)) = missing {
+        for (index, lent) in answers.into_iter().enumerate() {
+            if let Ok(instrument) = lent {
+                give_back(&acquisition.supervisors, index, Some(instrument));
             }
         }
+        let name = name_of(cell, missing);
         return Err(CellError::GivenUp {
-            reason: format!("device {:?} went away just now", name_of(cell, index)),
+            reason: format!("device {name:?} went away just now: {why}"),
         });
     }
+    let mut lent: Vec<Instrument> = answers.into_iter().flatten().collect();
     let mut probes = lent.split_off(cell.profilers.len().min(lent.len()));
     let robot = probes.split_off(cell.probes.len().min(probes.len()));
     let mut instruments = Instruments {
@@ -153,18 +162,18 @@ fn borrow(acquisition: &Acquisition) -> Result<Instruments, CellError> {
         profilers: Vec::new(),
         probes: Vec::new(),
     };
-    for (config, instrument) in cell.profilers.iter().zip(lent.into_iter().flatten()) {
+    for (config, instrument) in cell.profilers.iter().zip(lent) {
         instruments.profilers.push(Profiling {
             name: config.name.clone(),
             profiler: as_profiler(&config.name, instrument)?,
             calibration: config.calibration,
         });
     }
-    for (config, instrument) in cell.probes.iter().zip(probes.into_iter().flatten()) {
+    for (config, instrument) in cell.probes.iter().zip(probes) {
         let probe = as_probe(&config.name, instrument)?;
         instruments.probes.push((config.name.clone(), probe));
     }
-    for (config, instrument) in cell.carrier.iter().zip(robot.into_iter().flatten()) {
+    for (config, instrument) in cell.carrier.iter().zip(robot) {
         instruments.carrier = Some(as_carrier(config, instrument)?);
     }
     Ok(instruments)

@@ -27,9 +27,12 @@ pub(super) enum News {
     Failed(String),
 }
 
+/// The open device for a job, or why there is none.
+pub(super) type Lent = Result<Instrument, String>;
+
 /// What a device's thread is asked.
 enum Request {
-    Lend(Sender<Option<Instrument>>),
+    Lend(Sender<Lent>),
     Return(Option<Instrument>),
     Retry,
 }
@@ -60,11 +63,12 @@ impl Supervisor {
         })
     }
 
-    /// The open device, for a job; `None` where it is not open now.
-    pub(super) fn lend(&self) -> Option<Instrument> {
+    /// Asks for the device, for a job. It is asked whether it is still there, and opened anew where it does not say so: it may have been unplugged and
+    /// plugged in again since it was last heard. What comes on the channel is the device or why there is none; nothing comes where the cell ends.
+    pub(super) fn lend(&self) -> Receiver<Lent> {
         let (answer, answered) = channel();
         self.ask(Request::Lend(answer));
-        answered.recv().ok().flatten()
+        answered
     }
 
     /// Gives the device back; `None` for one that was lost: it is opened anew.
@@ -125,6 +129,7 @@ fn look_after(
 ) {
     let mut wait = WAIT_FIRST;
     let mut told_ready = false;
+    let mut wanted = None;
     loop {
         match setup.open(links) {
             Ok(instrument) => {
@@ -133,16 +138,21 @@ fn look_after(
                     tell(News::Ready(instrument.identity().clone()));
                     told_ready = true;
                 }
-                match keep(instrument, requests) {
-                    Kept::Check => {}
+                match keep(instrument, wanted.take(), requests) {
+                    Kept::Check(by) => wanted = by,
                     Kept::Lost => told_ready = false,
                     Kept::End => return,
                 }
             }
             Err(error) => {
                 told_ready = false;
-                tell(News::Failed(chain(&error)));
-                if !pause(wait, requests) {
+                let error = chain(&error);
+                if let Some(answer) = wanted.take() {
+                    // Nobody may be waiting any more.
+                    let _ = answer.send(Err(error.clone()));
+                }
+                tell(News::Failed(error.clone()));
+                if !pause(wait, &error, requests) {
                     return;
                 }
                 wait = (2 * wait).min(WAIT_MAX);
@@ -153,17 +163,24 @@ fn look_after(
 
 /// How the time with an open device ended.
 enum Kept {
-    /// It should be opened anew, to see whether it is still there: it did not say so itself.
-    Check,
+    /// It should be opened anew, to see whether it is still there: it did not say so itself. Then it is lent to who waits for it.
+    Check(Option<Sender<Lent>>),
     /// It is gone.
     Lost,
     /// The cell ends.
     End,
 }
 
-/// Keeps an open device until it is to be checked, was lost, or the cell ends; lends it meanwhile.
-fn keep(instrument: Instrument, requests: &Receiver<Request>) -> Kept {
+/// Keeps an open device until it is to be opened anew, was lost, or the cell ends; lends it meanwhile, at first to `wanted`.
+fn keep(
+    instrument: Instrument,
+    wanted: Option<Sender<Lent>>,
+    requests: &Receiver<Request>,
+) -> Kept {
     let mut held = Some(instrument);
+    if let Some(answer) = wanted {
+        held = hand_over(held, &answer);
+    }
     loop {
         // A device that is lent comes back in the end: the job that has it returns it, or says that it is lost.
         let request = match &held {
@@ -171,33 +188,39 @@ fn keep(instrument: Instrument, requests: &Receiver<Request>) -> Kept {
             None => requests.recv().map_err(RecvTimeoutError::from),
         };
         match request {
-            Ok(Request::Lend(answer)) => {
-                if let Err(unsent) = answer.send(held.take()) {
-                    held = unsent.0;
-                }
-            }
+            Ok(Request::Lend(answer)) => match held.as_mut().map(Instrument::check) {
+                Some(Err(_)) => return Kept::Check(Some(answer)),
+                // Where it knows no such question the job sees what is there.
+                _ => held = hand_over(held, &answer),
+            },
             Ok(Request::Return(Some(instrument))) => held = Some(instrument),
             Ok(Request::Return(None)) => return Kept::Lost,
             Ok(Request::Retry) => {}
             Err(RecvTimeoutError::Timeout) => match held.as_mut().map(Instrument::check) {
                 Some(Ok(Presence::Answered)) => {}
                 // Opening it anew tells, and says why where it is gone.
-                _ => return Kept::Check,
+                _ => return Kept::Check(None),
             },
             Err(RecvTimeoutError::Disconnected) => return Kept::End,
         }
     }
 }
 
-/// Waits for the next try; false where the cell ends.
-fn pause(wait: Duration, requests: &Receiver<Request>) -> bool {
+/// Sends a device to who asked for it; back where nobody waits any more.
+fn hand_over(held: Option<Instrument>, answer: &Sender<Lent>) -> Option<Instrument> {
+    let lent = held.ok_or_else(|| "another job has it".to_owned());
+    answer.send(lent).err().and_then(|unsent| unsent.0.ok())
+}
+
+/// Waits for the next try after a `failure`; false where the cell ends.
+fn pause(wait: Duration, failure: &str, requests: &Receiver<Request>) -> bool {
     let until = std::time::Instant::now() + wait;
     loop {
         let left = until.saturating_duration_since(std::time::Instant::now());
         match requests.recv_timeout(left) {
             Ok(Request::Lend(answer)) => {
                 // Nobody may be waiting any more.
-                let _ = answer.send(None);
+                let _ = answer.send(Err(failure.to_owned()));
             }
             Ok(Request::Return(_)) => {}
             Ok(Request::Retry) | Err(RecvTimeoutError::Timeout) => return true,

@@ -13,7 +13,7 @@ const BITS: u32 = 16;
 /// Indices of the distinct ones among finite `points` along a Hilbert curve through their bounding cube, and for every input index its
 /// place in that list. Where several points are equal the first in input order stands for all.
 pub fn along_hilbert_curve(points: &[DVec3]) -> (Vec<u32>, Vec<u32>) {
-    let (low, high) = bounds(points);
+    let (low, high) = bounds(points.iter().copied());
     let size = (high - low).max_element().max(f64::MIN_POSITIVE);
     let steps = f64::from(1u32 << BITS) * (1.0 - 1e-9) / size;
     let mut keyed: Vec<(u64, u32)> = points
@@ -47,11 +47,10 @@ pub fn along_hilbert_curve(points: &[DVec3]) -> (Vec<u32>, Vec<u32>) {
     (distinct, place)
 }
 
-pub fn bounds(points: &[DVec3]) -> (DVec3, DVec3) {
-    let first = points.first().copied().unwrap_or(DVec3::ZERO);
-    points
-        .iter()
-        .fold((first, first), |(low, high), p| (low.min(*p), high.max(*p)))
+pub fn bounds(points: impl IntoIterator<Item = DVec3>) -> (DVec3, DVec3) {
+    let mut points = points.into_iter();
+    let first = points.next().unwrap_or(DVec3::ZERO);
+    points.fold((first, first), |(low, high), p| (low.min(p), high.max(p)))
 }
 
 /// Place of a cell of the cube along the curve (Skilling, *Programming the Hilbert curve*, 2004).

@@ -7,6 +7,9 @@
 //!
 //! An exchange moves the surface through the tetrahedron of the four corners. It is made only where nothing else of the mesh is in that
 //! tetrahedron, by exact signs, so a mesh that does not cross itself never will.
+//!
+//! Large meshes are worked on in blocks of space at once, then where the blocks meet. What changes in a block is spanned by the block's own points,
+//! so that two blocks, which a plane parts, never meet.
 
 use std::cmp::Ordering;
 use std::collections::BinaryHeap;
@@ -14,8 +17,10 @@ use std::collections::BinaryHeap;
 use glam::DVec3;
 use rayon::prelude::*;
 
+use super::blocks::{Blocks, meets};
 use super::boxes::Boxes;
 use super::crossing::{diagonals_cross, is_within, overlap};
+use super::curve::bounds;
 use super::predicates::Signs;
 
 /// A change gains at least this share of the bends it touches: less is rounding.
@@ -33,6 +38,9 @@ const MOST_LOSS: f64 = 0.7;
 /// Rounds of trying; later ones find next to nothing.
 const MOST_ROUNDS: usize = 8;
 
+/// Points of a block at most: what surrounds them fits in the cache of a core. The 80,000 triangles of a block of random points are some eight blocks.
+const BLOCK: usize = 1 << 14;
+
 /// The other side of an edge that has not two triangles.
 const NONE: u32 = u32::MAX;
 
@@ -40,10 +48,76 @@ const NONE: u32 = u32::MAX;
 ///
 /// Corners, pieces and handles stay the same. The result does not depend on the number of threads.
 pub(super) fn flip(points: &[DVec3], triangles: &mut Vec<[u32; 3]>) -> usize {
-    let mut surface = Surface::new(points, std::mem::take(triangles));
-    let flips = surface.flip_single() + surface.flip_together();
+    flip_by(BLOCK, points, triangles)
+}
+
+/// By blocks of at most `most` points.
+fn flip_by(most: usize, points: &[DVec3], triangles: &mut Vec<[u32; 3]>) -> usize {
+    let blocks = Blocks::new(points, most);
+    let mut flips = 0;
+    if blocks.len() > 1 {
+        let boxes = Boxes::new(points, triangles);
+        let made: Vec<_> = (0..blocks.len())
+            .into_par_iter()
+            .map(|i| flip_block(points, triangles, &boxes, blocks.points(i)))
+            .collect();
+        for (count, changed) in made {
+            flips += count;
+            for (t, corners) in changed {
+                triangles[t as usize] = corners;
+            }
+        }
+    }
+    let mut surface = Surface::new(points, std::mem::take(triangles), points.len() as u32);
+    let places = if blocks.len() > 1 {
+        surface.between(&blocks.numbers())
+    } else {
+        (0..surface.triangles.len() as u32).collect()
+    };
+    flips += surface.settle(places);
     *triangles = surface.triangles;
     flips
+}
+
+/// Exchanges diagonals among the points of a block; how many, and the triangles that have changed.
+fn flip_block(
+    points: &[DVec3],
+    triangles: &[[u32; 3]],
+    boxes: &Boxes,
+    block: &[u32],
+) -> (usize, Vec<(u32, [u32; 3])>) {
+    let around = bounds(block.iter().map(|v| points[*v as usize]));
+    let mut near: Vec<u32> = Vec::new();
+    boxes.all_near(around, triangles.len(), |t| {
+        let corners = triangles[t as usize].map(|v| points[v as usize]);
+        if meets(&corners, around) {
+            near.push(t);
+        }
+        true
+    });
+    near.sort_unstable();
+    // The block's own points first.
+    let corners = near.iter().flat_map(|t| triangles[*t as usize]);
+    let mut others: Vec<u32> = corners
+        .filter(|v| block.binary_search(v).is_err())
+        .collect();
+    others.sort_unstable();
+    others.dedup();
+    let global: Vec<u32> = block.iter().chain(&others).copied().collect();
+    let local = |v: u32| match block.binary_search(&v) {
+        Ok(i) => i as u32,
+        Err(_) => (block.len() + others.partition_point(|o| *o < v)) as u32,
+    };
+    let own_points: Vec<DVec3> = global.iter().map(|v| points[*v as usize]).collect();
+    let own: Vec<[u32; 3]> = (near.iter().map(|t| triangles[*t as usize].map(local))).collect();
+    let mut surface = Surface::new(&own_points, own.clone(), block.len() as u32);
+    let flips = surface.settle((0..near.len() as u32).collect());
+    let changed = (0..near.len()).filter(|i| surface.triangles[*i] != own[*i]);
+    let changed = changed.map(|i| {
+        let corners = surface.triangles[i].map(|v| global[v as usize]);
+        (near[i], corners)
+    });
+    (flips, changed.collect())
 }
 
 /// The half edge that follows in its triangle.
@@ -68,6 +142,8 @@ fn last(half: u32) -> u32 {
 struct Surface<'a> {
     points: &'a [DVec3],
     signs: Signs,
+    /// Points from this one on keep their edges: only what lies among those before it is exchanged.
+    own: u32,
     triangles: Vec<[u32; 3]>,
     /// For every half edge of a triangle the one on the other side.
     twins: Vec<[u32; 3]>,
@@ -108,25 +184,55 @@ struct Step {
 }
 
 impl<'a> Surface<'a> {
-    fn new(points: &'a [DVec3], triangles: Vec<[u32; 3]>) -> Self {
-        let twins = twins(&triangles);
-        let boxes = Boxes::new(points, &triangles);
-        let mut surface = Self {
+    fn new(points: &'a [DVec3], triangles: Vec<[u32; 3]>, own: u32) -> Self {
+        Self {
             points,
             signs: Signs::of(points),
+            own,
+            twins: twins(&triangles),
+            boxes: Boxes::new(points, &triangles),
             triangles,
-            twins,
-            boxes,
             queue: BinaryHeap::new(),
-        };
-        let entries: Vec<Entry> = (0..surface.triangles.len() as u32)
-            .into_par_iter()
-            .flat_map_iter(|t| [4 * t, 4 * t + 1, 4 * t + 2])
-            .filter(|h| *h < surface.twin(*h))
-            .filter_map(|h| surface.entry(h))
+        }
+    }
+
+    /// Exchanges what gains at the triangles `places`, and whatever gains by that.
+    fn settle(&mut self, places: Vec<u32>) -> usize {
+        let edges = self.edges_of(&places, |_| true);
+        let entries: Vec<Entry> = (edges.into_par_iter())
+            .filter_map(|(_, h)| self.entry(h))
             .collect();
-        surface.queue = entries.into();
-        surface
+        self.queue = entries.into();
+        self.flip_single() + self.flip_together(places)
+    }
+
+    /// The edges of triangles that may be exchanged and are `asked` for, in the order of their ends.
+    fn edges_of(
+        &self,
+        triangles: &[u32],
+        asked: impl Fn(u32) -> bool + Sync,
+    ) -> Vec<((u32, u32), u32)> {
+        let mut edges: Vec<((u32, u32), u32)> = (triangles.par_iter())
+            .flat_map_iter(|t| [4 * t, 4 * t + 1, 4 * t + 2])
+            .filter(|h| self.is_own(*h) && asked(*h))
+            .map(|h| (self.ends(h), h.min(self.twin(h))))
+            .collect();
+        edges.par_sort_unstable();
+        edges.dedup();
+        edges
+    }
+
+    /// The triangles with corners in several blocks, and those beside them.
+    fn between(&self, blocks: &[u32]) -> Vec<u32> {
+        let parted = |t: u32| {
+            let [a, b, c] = self.triangles[t as usize].map(|v| blocks[v as usize]);
+            a != b || b != c
+        };
+        let beside = |t: u32| self.twins[t as usize].map(|h| h / 4);
+        (0..self.triangles.len() as u32)
+            .into_par_iter()
+            .filter(|t| parted(*t) || beside(*t).iter().any(|n| *n != NONE / 4 && parted(*n)))
+            .collect()
     }
 
     #[inline]
@@ -150,6 +256,12 @@ impl<'a> Surface<'a> {
         let beyond = self.apex(self.twin(half));
         let [begin, end] = [next(half), last(half)].map(|h| self.apex(h));
         [begin, end, self.apex(half), beyond]
+    }
+
+    /// Whether an edge has two triangles, and none of their corners is to keep its edges.
+    #[inline]
+    fn is_own(&self, half: u32) -> bool {
+        self.twin(half) != NONE && self.corners(half).iter().all(|v| *v < self.own)
     }
 
     /// The ends of an edge, the lower first.
@@ -198,11 +310,10 @@ impl<'a> Surface<'a> {
     }
 
     fn entry(&self, half: u32) -> Option<Entry> {
-        let twin = self.twin(half);
-        if twin == NONE {
+        if !self.is_own(half) {
             return None;
         }
-        let half = half.min(twin);
+        let half = half.min(self.twin(half));
         let before = self.bends(half, false);
         let gain = before - self.bends(half, true);
         (gain > LEAST_GAIN * before).then(|| Entry {
@@ -257,12 +368,10 @@ impl<'a> Surface<'a> {
         let keeps_out = |t: u32| {
             let corners = self.triangles[t as usize];
             let p = corners.map(|v| self.at(v));
-            let is_apart = p[0].min(p[1]).min(p[2]).cmpgt(high).any()
-                || p[0].max(p[1]).max(p[2]).cmplt(low).any();
             let ends_within =
                 |k: usize| !ids.contains(&corners[k]) && is_within(&self.signs, places, p[k]);
             own.contains(&t)
-                || is_apart
+                || !meets(&p, (low, high))
                 || !((0..3).any(ends_within)
                     || new.iter().any(|n| overlap(&self.signs, n, &(corners, p))))
         };
@@ -353,18 +462,12 @@ impl<'a> Surface<'a> {
         flips
     }
 
-    /// Exchanges several diagonals beside one another that gain only together, at first anywhere on sharp edges, then where something has changed.
-    fn flip_together(&mut self) -> usize {
+    /// Exchanges several diagonals beside one another that gain only together, at first on the sharp edges of `places`, then where something has
+    /// changed.
+    fn flip_together(&mut self, mut places: Vec<u32>) -> usize {
         let mut flips = 0;
-        let mut places: Vec<u32> = (0..self.triangles.len() as u32).collect();
         for _ in 0..MOST_ROUNDS {
-            let mut edges: Vec<((u32, u32), u32)> = (places.par_iter())
-                .flat_map_iter(|t| [4 * t, 4 * t + 1, 4 * t + 2])
-                .filter(|h| self.twin(*h) != NONE && self.is_sharp_at(*h))
-                .map(|h| (self.ends(h), h.min(self.twin(h))))
-                .collect();
-            edges.par_sort_unstable();
-            edges.dedup();
+            let edges = self.edges_of(&places, |h| self.is_sharp_at(h));
             places.clear();
             for (ends, half) in edges {
                 let mut steps = Vec::new();
@@ -396,7 +499,7 @@ impl<'a> Surface<'a> {
 
     /// Exchanges a diagonal and, if that does not gain, one of its rim, and so on; false where nothing gains in the end, and nothing is changed.
     fn follow(&mut self, half: u32, (all, gained): (f64, f64), steps: &mut Vec<Step>) -> bool {
-        if self.twin(half) == NONE {
+        if !self.is_own(half) {
             return false;
         }
         let is_last = steps.len() + 1 == MOST_STEPS;
@@ -501,79 +604,4 @@ fn bend(a: DVec3, b: DVec3, c: DVec3, d: DVec3) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn bends_of_a_flat_a_right_and_a_folded_edge() {
-        let (a, b) = (DVec3::ZERO, DVec3::X * 2.0);
-        let c = DVec3::new(1.0, 1.0, 0.0);
-        assert_eq!(bend(a, b, c, DVec3::new(0.3, -2.0, 0.0)), 0.0);
-        let right = bend(a, b, c, DVec3::new(1.0, 0.0, -1.0));
-        assert!((right - 2.0 * std::f64::consts::FRAC_PI_2.sqrt()).abs() < 1e-12);
-        let folded = bend(a, b, c, DVec3::new(1.0, 3.0, 0.0));
-        assert!((folded - 2.0 * std::f64::consts::PI.sqrt()).abs() < 1e-12);
-    }
-
-    /// A roof of two triangles over a floor, the ridge across the valley: its diagonal gains.
-    fn roof(more: &[DVec3]) -> (Vec<DVec3>, Vec<[u32; 3]>) {
-        let corners = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]];
-        let mut points: Vec<DVec3> = corners
-            .iter()
-            .map(|c| DVec3::new(c[0], c[1], -3.0))
-            .collect();
-        // Two opposite corners of the roof are higher.
-        points.extend((0..4).map(|i| {
-            let z = f64::from(i % 2);
-            DVec3::new(corners[i as usize][0], corners[i as usize][1], z)
-        }));
-        points.extend(more);
-        let mut triangles = vec![[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7]];
-        for i in 0..4 {
-            let j = (i + 1) % 4;
-            triangles.extend([[i, j, 4 + j], [i, 4 + j, 4 + i]]);
-        }
-        (points, triangles)
-    }
-
-    #[test]
-    fn a_diagonal_is_exchanged_and_steps_are_taken_back() {
-        let (points, triangles) = roof(&[]);
-        let mut surface = Surface::new(&points, triangles.clone());
-        let half = 4 * 2 + 1;
-        assert_eq!(surface.ends(half), (4, 6));
-        assert!(surface.is_whole(half) && surface.is_free(half));
-        let bends = [false, true].map(|other| surface.bends(half, other));
-        let twins = surface.twins.clone();
-        let step = surface.step(half);
-        surface.swap(half);
-        assert_eq!(surface.ends(half & !3), (5, 7));
-        let turned = [true, false].map(|other| surface.bends(half & !3, other));
-        // The same in another order.
-        assert!((0..2).all(|i| (bends[i] - turned[i]).abs() < 1e-12));
-        let made = crate::mesh::topology(8, &surface.triangles);
-        assert!(made.is_watertight() && made.is_manifold());
-        assert_eq!(super::twins(&surface.triangles), surface.twins);
-        surface.take_back(&step);
-        assert_eq!((surface.triangles, surface.twins), (triangles, twins));
-    }
-
-    #[test]
-    fn a_diagonal_stays_where_something_is_in_the_way() {
-        let small = |at: DVec3, size: f64| {
-            [DVec3::ZERO, DVec3::X, DVec3::Y, DVec3::Z].map(|way| at + way * size)
-        };
-        // Over the valley and under the ridge it may not pass: within the tetrahedron, through its upper face, and clear of it above and below.
-        for (at, size, is_free) in [
-            (DVec3::new(0.9, 0.9, 0.3), 0.1, false),
-            (DVec3::new(0.9, 0.9, -0.5), 2.0, false),
-            (DVec3::new(0.9, 0.9, 1.1), 0.1, true),
-            (DVec3::new(0.9, 0.9, -0.3), 0.1, true),
-        ] {
-            let (points, mut triangles) = roof(&small(at, size));
-            triangles.extend([[8, 10, 9], [8, 9, 11], [9, 10, 11], [10, 8, 11]]);
-            let surface = Surface::new(&points, triangles);
-            assert_eq!(surface.is_free(4 * 2 + 1), is_free, "{at}, {size}");
-        }
-    }
-}
+mod tests;

@@ -25,7 +25,7 @@ pub fn render(
         nearness: vec![f64::NEG_INFINITY; (width * height) as usize],
         pixels: vec![0xff; 3 * (width * height) as usize],
     };
-    let (low, high) = super::curve::bounds(&points);
+    let (low, high) = super::curve::bounds(points.iter().copied());
     let extent = (high - low).truncate().max_element().max(f64::MIN_POSITIVE);
     let size = f64::from(width.min(height));
     let scale = 0.94 * size / extent;
