@@ -34,7 +34,8 @@ const RATE: &str = "76.0";
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let rounds = arguments.iter().find_map(|a| a.parse().ok()).unwrap_or(50);
+    let rounds: usize = arguments.iter().find_map(|a| a.parse().ok()).unwrap_or(50);
+    let rounds = rounds.max(1);
     let stages = arguments.iter().any(|a| a == "stages");
     let (playing, folder) = set_up(!stages);
     if stages {
@@ -129,7 +130,8 @@ fn in_the_daemon(folder: &Path, rounds: usize, page: bool) {
     let handle = running.handle.clone();
     let _browsers = page.then(|| opened(handle.clone(), cell.service, folder));
     let mut seconds: Vec<f64> = Vec::new();
-    for round in 0..rounds {
+    // In the first round the simulators compute, on all cores, what they send in the others: it is not counted.
+    for round in 0..=rounds {
         let id = running.start_part(&format!("part {round}"));
         let (began, busy) = (Instant::now(), processor_seconds());
         running.until("acquired", |s| !acquiring(s, id));
@@ -148,12 +150,15 @@ fn in_the_daemon(folder: &Path, rounds: usize, page: bool) {
             );
         }
         println!(
-            "    {round}: {latency:.3} s ({:.3} to the values, the rest report and store), {:.1} % of the scan, processor {:.2} cores during the scan",
+            "    {round}{}: {latency:.3} s ({:.3} to the values, the rest report and store), {:.1} % of the scan, processor {:.2} cores during the scan",
+            if round == 0 { " (not counted)" } else { "" },
             kept.verdict_seconds.unwrap_or(f64::NAN),
             100.0 * latency / scan,
             busy / scan
         );
-        seconds.push(latency);
+        if round > 0 {
+            seconds.push(latency);
+        }
     }
     let last = handle.snapshot().last.as_ref().map(|last| last.id);
     let report = last.and_then(|id| handle.store().report_json(id).ok());
