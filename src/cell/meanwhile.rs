@@ -23,6 +23,9 @@ const PIECE: usize = 12_000;
 /// How often edges are measured at most: as often as people can follow.
 const MEASURE_EVERY: Duration = Duration::from_millis(700);
 
+/// How often at least, however many points wait: what is put off is measured in the end, when the verdict waits for it.
+const MEASURE_AT_LEAST_EVERY: Duration = Duration::from_millis(2000);
+
 /// Share of the scan after which the edges are not looked at before it has ended.
 const LAST_LOOK: f64 = 0.96;
 
@@ -104,8 +107,9 @@ fn follow(
                 // What is looked at now would keep the verdict waiting.
                 fresh = growing.is_placed() && share < LAST_LOOK;
                 // As soon as anything can be seen, however much waits.
-                if fresh && looked.is_none() {
-                    looked = look(&mut growing);
+                let overdue = looked.is_none_or(|at| at.elapsed() >= MEASURE_AT_LEAST_EVERY);
+                if fresh && overdue {
+                    (looked, fresh) = (look(&mut growing), false);
                 }
             }
             Message::End(points) => return (growing.len() == points).then(|| growing.finish()),

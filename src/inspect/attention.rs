@@ -36,8 +36,8 @@ const LOOK: i32 = 1;
 /// Patches around those that the detector needs to see.
 const SEE: i32 = 2;
 
-/// Points that one task looks at.
-const BLOCK: usize = 1 << 16;
+/// Points that one task looks at: a piece of a scan that comes bit by bit is a few of them.
+const BLOCK: usize = 1 << 12;
 
 /// A cell of space, about a patch wide.
 type Cell = IVec3;
@@ -77,7 +77,16 @@ impl Outline {
 
     /// The cells in which `positions` lie.
     pub(super) fn cells_of(&self, positions: &[DVec3]) -> CellSet {
-        positions.iter().map(|p| self.grid.cell(*p)).collect()
+        let mut cells = CellSet::default();
+        let mut last = None;
+        for p in positions {
+            let cell = self.grid.cell(*p);
+            // Neighbours follow one another.
+            if last.replace(cell) != Some(cell) {
+                cells.insert(cell);
+            }
+        }
+        cells
     }
 
     /// Whether `p` lies near a nominal edge; `hit` is scratch.

@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use serde::Serialize;
 
 use super::align::{
-    Aligned, Candidates, Conclusion, LaidPoint, Scan, align_again, align_keeping, settle,
+    Aligned, Candidates, Conclusion, LaidPoint, Scan, Twist, align_again, align_keeping, settle,
 };
 use super::assign::{Place, Surface, towards};
 use super::attention::{CellSet, Outline, Patches};
@@ -56,6 +56,13 @@ const SAME_NOISE: f64 = 0.15;
 
 /// Motion over the noise, at the half-diagonal, that values follow by first order: on a face of 5 mm radius 20 um leave 0.04 um.
 const SMALL_MOTION: f64 = 2.0;
+
+/// Motion on the way up to which points stay where they were laid: half of what would be too far at the end, as it may go on.
+const NEAR_ENOUGH: f64 = 0.5 * SMALL_MOTION;
+
+/// The first pieces tell of spacing and noise, then one of so many: as many places as a scan that comes at once is asked at.
+const ESTIMATED_ALL: usize = 24;
+const ESTIMATED_EVERY: usize = 4;
 
 /// A part that is being scanned and measured.
 pub struct Growing<'a, B: Body> {
@@ -102,6 +109,22 @@ struct Base<'a, B: Body> {
     measuring: Measuring<'a, B>,
     /// Points of the scan when it was last asked whether the pose holds.
     asked: usize,
+}
+
+impl<B: Body> Base<'_, B> {
+    /// Whether the points were laid as those of a scan of this spacing and noise, mm.
+    fn is_of(&self, (spacing, noise_mm): (Spacing, f64)) -> bool {
+        let is_same = |a: f64, b: f64, by: f64| (a - b).abs() <= by * b.abs();
+        is_same(self.spacing.along_mm, spacing.along_mm, SAME_SPACING)
+            && is_same(self.spacing.across_mm, spacing.across_mm, SAME_SPACING)
+            && is_same(self.noise_mm, noise_mm, SAME_NOISE)
+    }
+
+    /// Whether a body of half-diagonal `size_mm` moves from here to `pose` by no more than `far` times the noise.
+    fn is_near(&self, pose: &RigidTransform, far: f64, size_mm: f64) -> bool {
+        let motion = *pose * self.pose.inverse();
+        Twist::logarithm(&motion).size(size_mm) <= far * self.noise_mm
+    }
 }
 
 /// What the search for the pose ended at.
@@ -173,8 +196,10 @@ impl<'a, B: Body> Growing<'a, B> {
             return;
         }
         self.points += piece.len();
-        let neighbors = Neighbors::new(&piece.positions);
-        self.estimator.add(&piece, &neighbors);
+        if self.pieces.len() < ESTIMATED_ALL || self.pieces.len().is_multiple_of(ESTIMATED_EVERY) {
+            let neighbors = Neighbors::new(&piece.positions);
+            self.estimator.add(&piece, &neighbors);
+        }
         self.draw(&piece);
         self.pieces.push(Piece {
             machine: piece,
@@ -185,11 +210,10 @@ impl<'a, B: Body> Growing<'a, B> {
         });
         let last = self.pieces.len() - 1;
         let due = |base: &Base<'_, B>| self.points as f64 > AGAIN * base.searched.points as f64;
-        if self.base.as_ref().is_none_or(due) {
-            self.find_base();
-        } else {
-            self.lay(last);
+        if self.base.as_ref().is_none_or(due) && self.find_base() {
+            return;
         }
+        self.lay(last);
     }
 
     /// Measures what has been laid; the edges as they are now.
@@ -341,27 +365,34 @@ impl<'a, B: Body> Growing<'a, B> {
         }
     }
 
-    /// Searches for the pose by the points so far, and lays them all.
-    fn find_base(&mut self) {
-        let Some((spacing, noise_mm)) = self.estimator.estimate() else {
-            return;
+    /// Searches for the pose by the points so far, and lays them all where they do not lie at it already; whether it did.
+    fn find_base(&mut self) -> bool {
+        let Some(known) = self.estimator.estimate() else {
+            return false;
         };
         if self.sketch.len() < SKETCH_ENOUGH {
-            return;
+            return false;
         }
         let neighbors = Neighbors::new(&self.sketch.positions);
-        let scan = self.sketch_scan(&neighbors, (spacing, noise_mm));
+        let scan = self.sketch_scan(&neighbors, known);
         let options = self.datums.options(&self.request);
         let (aligned, candidates) =
             align_keeping(&scan, &self.surface, self.request.start, &options);
-        self.set_base(
-            aligned.alignment.part_from_machine,
-            (spacing, noise_mm),
-            Searched {
-                candidates,
-                points: self.points,
-            },
-        );
+        let pose = aligned.alignment.part_from_machine;
+        let searched = Searched {
+            candidates,
+            points: self.points,
+        };
+        let size_mm = self.surface.size_mm();
+        if let Some(base) = &mut self.base
+            && base.is_of(known)
+            && base.is_near(&pose, NEAR_ENOUGH, size_mm)
+        {
+            base.searched = searched;
+            return false;
+        }
+        self.set_base(pose, known, searched);
+        true
     }
 
     /// Lays all points at `pose`, for a scan of this spacing and noise.
@@ -439,8 +470,7 @@ impl<'a, B: Body> Growing<'a, B> {
         let options = self.datums.options(&self.request);
         let settled = settle(&scan, &self.surface, self.request.start, &options, known);
         if let Some(pose) = settled {
-            // Half of what would be too far at the end: it may go on.
-            self.lay_again(pose, 0.5 * SMALL_MOTION);
+            self.lay_again(pose, NEAR_ENOUGH);
         }
     }
 
@@ -449,16 +479,11 @@ impl<'a, B: Body> Growing<'a, B> {
         let Some((spacing, noise_mm)) = self.estimator.estimate() else {
             return;
         };
-        let differs = |a: f64, b: f64, by: f64| (a - b).abs() > by * b.abs();
-        let other = |base: &Base<'_, B>| {
-            differs(base.spacing.along_mm, spacing.along_mm, SAME_SPACING)
-                || differs(base.spacing.across_mm, spacing.across_mm, SAME_SPACING)
-                || differs(base.noise_mm, noise_mm, SAME_NOISE)
-        };
         let Some(base) = self.base.as_mut() else {
-            return self.find_base();
+            self.find_base();
+            return;
         };
-        if other(base) {
+        if !base.is_of((spacing, noise_mm)) {
             let searched = std::mem::take(&mut base.searched);
             let pose = base.pose;
             self.set_base(pose, (spacing, noise_mm), searched);
@@ -515,13 +540,10 @@ impl<'a, B: Body> Growing<'a, B> {
         let Some(base) = &mut self.base else {
             return false;
         };
-        let motion = pose * base.pose.inverse();
-        let moved = super::align::Twist::logarithm(&motion).size(self.surface.size_mm());
-        if moved <= far * base.noise_mm {
+        if base.is_near(&pose, far, self.surface.size_mm()) {
             return false;
         }
         tracing::debug!(
-            moved_mm = moved,
             points = self.points,
             "the pose has moved too far: all points are laid again"
         );
@@ -576,7 +598,6 @@ mod tests {
 
     use super::*;
     use crate::inspect::Recipe;
-    use crate::inspect::align::Twist;
     use crate::nominal::Nominal;
     use crate::points::{Origin, View};
 
