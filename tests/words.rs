@@ -12,7 +12,7 @@ const TOLD: &[&str] = &[
     "drivers/src/settings.rs",
     "src/inspect.rs",
     "src/inspect",
-    "src/nominal/error.rs",
+    "src/nominal",
     "src/acquire/assembler.rs",
     "src/acquire/carried.rs",
     "src/acquire/run.rs",
