@@ -13,7 +13,6 @@ use rayon::prelude::*;
 
 use super::assign::{NO_FACE, Place};
 use super::body::{Body, BodyEdge};
-use crate::points::Neighbors;
 
 /// Width of a patch in spacings: an edge shorter than this is an accident.
 const PATCH: f64 = 8.0;
@@ -44,8 +43,8 @@ type Cell = IVec3;
 
 /// The nominal edges, for telling what lies near one.
 pub(super) struct Outline {
-    along: Neighbors,
-    cells: CellSet,
+    /// Of every cell that something near an edge may lie in, the places along edges that may be near.
+    along: HashMap<Cell, Vec<DVec3>, FixedState>,
     grid: Grid,
     near_mm: f64,
 }
@@ -54,17 +53,20 @@ impl Outline {
     /// `near_mm` is the distance within which what is found belongs to a nominal edge.
     pub(super) fn new<B: Body>(nominal: &B, edges: &[BodyEdge], near_mm: f64) -> Self {
         let grid = Grid::new(PATCH / super::compare::NEAR * near_mm);
-        let mut places = Vec::new();
+        let mut along: HashMap<Cell, Vec<DVec3>, FixedState> = HashMap::default();
         for (e, edge) in edges.iter().enumerate() {
             let count = (edge.length_mm / (0.5 * near_mm)).ceil().clamp(1.0, 1e5) as usize;
             let at = |k: usize| edge.length_mm * k as f64 / count as f64;
-            places.extend((0..=count).map(|k| nominal.station(e, at(k)).point));
+            for k in 0..=count {
+                let place = nominal.station(e, at(k)).point;
+                // A cell is wider than what is near.
+                for cell in around(grid.cell(place), 1) {
+                    along.entry(cell).or_default().push(place);
+                }
+            }
         }
-        // A cell is wider than what is near.
-        let cells = places.iter().flat_map(|p| around(grid.cell(*p), 1));
         Self {
-            cells: cells.collect(),
-            along: Neighbors::new(&places),
+            along,
             grid,
             near_mm,
         }
@@ -89,14 +91,11 @@ impl Outline {
         cells
     }
 
-    /// Whether `p` lies near a nominal edge; `hit` is scratch.
-    pub(super) fn is_near(&self, p: DVec3, hit: &mut Vec<(u32, f64)>) -> bool {
-        if !self.cells.contains(&self.grid.cell(p)) {
-            return false;
-        }
-        self.along.nearest(p, 1, hit);
-        hit.first()
-            .is_some_and(|h| h.1 <= self.near_mm * self.near_mm)
+    /// Whether `p` lies near a nominal edge.
+    pub(super) fn is_near(&self, p: DVec3) -> bool {
+        let places = self.along.get(&self.grid.cell(p));
+        let is_near = |place: &DVec3| place.distance_squared(p) <= self.near_mm * self.near_mm;
+        places.is_some_and(|places| places.iter().any(is_near))
     }
 }
 
@@ -137,10 +136,9 @@ impl Patches {
 
 /// The moments of the patches that a block of points touches, a patch as often as the scan lines cross it.
 fn runs(positions: &[DVec3], places: &[Place], outline: &Outline) -> Vec<((u32, Cell), Moments)> {
-    let mut hit = Vec::new();
     let mut runs: Vec<((u32, Cell), Moments)> = Vec::new();
     for (p, place) in positions.iter().zip(places) {
-        if place.face == NO_FACE || outline.is_near(*p, &mut hit) {
+        if place.face == NO_FACE || outline.is_near(*p) {
             continue;
         }
         let cell = outline.grid.cell(*p);

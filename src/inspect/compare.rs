@@ -113,11 +113,10 @@ fn edges_found(scanned: &Scanned<'_>, cells: &CellSet, places: &[DVec3]) -> Vec<
 }
 
 fn unexpected(found: &[DVec3], outline: &Outline) -> Vec<Vec<DVec3>> {
-    let mut hit = Vec::new();
     let strange: Vec<DVec3> = found
         .iter()
         .copied()
-        .filter(|p| !outline.is_near(*p, &mut hit))
+        .filter(|p| !outline.is_near(*p))
         .collect();
     let near_mm = outline.near_mm();
     let mut lines: Vec<Vec<DVec3>> = clusters(&strange, 0.5 * near_mm)

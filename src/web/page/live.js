@@ -6,6 +6,8 @@ import { t } from "./text.js";
 
 /** Between two looks at the daemon, ms: quick enough to look alive, slow enough for a tablet. */
 const EVERY_MS = 200;
+/** And so many times as long as a look took: a tenth of a slow processor, which may be the one that computes the verdict. */
+const REST = 9;
 /** After the scan the verdict is computed, perhaps on the machine that shows the page: the last look waits for it, ms. */
 const LAST_MS = 600;
 /** A frame of numbers does not move when nothing new came: the picture is drawn only then. */
@@ -27,16 +29,19 @@ export function livePictures() {
   // Nothing yet: the first look shows the scan that ran last.
   let running = null;
   const look = async () => {
+    let busy = 0;
     try {
       const [profiles, stations] = await Promise.all([get("/live/profiles"), edges.fetch(), points.fetch()]);
+      const began = performance.now();
       // What is measured in the end stands in the result.
       edges.element.hidden = !running || stations.length === 0;
       points.stations = running ? stations : [];
       drawProfiles(profile, profiles);
       points.draw();
       amount.textContent = t("live.amount", { count: points.shown.toLocaleString(document.documentElement.lang) });
+      busy = performance.now() - began;
     } catch { /* the banner says that the daemon is away */ }
-    if (!ended && running) timer = setTimeout(look, EVERY_MS);
+    if (!ended && running) timer = setTimeout(look, Math.max(EVERY_MS, REST * busy));
   };
   return {
     element,
@@ -131,6 +136,8 @@ class Points {
     this.generation = 0;
     this.shown = 0;
     this.values = new Float32Array(3 * 1024);
+    this.low = [];
+    this.high = [];
     this.turn = -0.6;
     this.tilt = 0.9;
     canvas.addEventListener("pointerdown", (event) => {
@@ -159,7 +166,14 @@ class Points {
       larger.set(this.values.subarray(0, from * 3));
       this.values = larger;
     }
-    for (let index = 0; index < count; index += 1) this.values[from * 3 + index] = view.getFloat32(4 * index, true);
+    if (from === 0) [this.low, this.high] = [Array(3).fill(Infinity), Array(3).fill(-Infinity)];
+    for (let index = 0; index < count; index += 1) {
+      const value = view.getFloat32(4 * index, true);
+      const axis = index % 3;
+      this.values[from * 3 + index] = value;
+      if (value < this.low[axis]) this.low[axis] = value;
+      if (value > this.high[axis]) this.high[axis] = value;
+    }
     this.shown = from + count / 3;
   }
 
@@ -167,14 +181,7 @@ class Points {
     const { context, width, height, scale } = surface(this.canvas);
     context.clearRect(0, 0, width, height);
     if (!this.shown) return;
-    const { values, shown } = this;
-    const low = [Infinity, Infinity, Infinity];
-    const high = [-Infinity, -Infinity, -Infinity];
-    for (let index = 0; index < 3 * shown; index += 1) {
-      const axis = index % 3;
-      if (values[index] < low[axis]) low[axis] = values[index];
-      if (values[index] > high[axis]) high[axis] = values[index];
-    }
+    const { values, shown, low, high } = this;
     const middle = low.map((value, axis) => (value + high[axis]) / 2);
     const zoom = 0.92 * Math.min(width, height * 1.2) / Math.max(Math.hypot(...high.map((value, axis) => value - low[axis])), 1e-3);
     const [sine, cosine] = [Math.sin(this.turn), Math.cos(this.turn)];
@@ -193,7 +200,7 @@ class Points {
       const towards = -along * flat + z * rise;
       const px = Math.round(width / 2 + across * zoom);
       const py = Math.round(height / 2 - (along * rise + z * flat) * zoom);
-      const shade = hue((values[3 * index + 2] - low[2]) / tall);
+      const shade = SHADES[Math.round((values[3 * index + 2] - low[2]) / tall * (SHADES.length - 1))];
       for (let dy = 0; dy < size; dy += 1) {
         for (let dx = 0; dx < size; dx += 1) {
           const place = (py + dy) * width + px + dx;
@@ -219,8 +226,10 @@ class Points {
 // From dark blue over teal to yellow: lighter is higher, also where colours cannot be told apart.
 const STOPS = [[49, 78, 140], [38, 130, 142], [60, 170, 110], [222, 200, 60]];
 
+const SHADES = Uint32Array.from({ length: 256 }, (_, index) => hue(index / 256));
+
 function hue(share) {
-  const place = Math.min(Math.max(share, 0), 0.9999) * (STOPS.length - 1);
+  const place = share * (STOPS.length - 1);
   const [below, above] = [STOPS[Math.floor(place)], STOPS[Math.floor(place) + 1]];
   const part = place % 1;
   const [r, g, b] = below.map((value, index) => Math.round(value + (above[index] - value) * part));
