@@ -25,7 +25,7 @@ use crate::config::Cell;
 use crate::store::{ScanFileError, ScanWriter, StoredCarrier, StoredView};
 
 /// How often progress is told.
-const TELL_EVERY: Duration = Duration::from_millis(100);
+const TELL_EVERY: Duration = Duration::from_millis(250);
 
 /// What an acquisition needs.
 pub(super) struct Acquisition {

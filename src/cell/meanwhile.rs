@@ -21,10 +21,10 @@ use crate::points::{Frame, Origin, PointCloud, View};
 const PIECE: usize = 12_000;
 
 /// How often edges are measured at most: as often as people can follow.
-const MEASURE_EVERY: Duration = Duration::from_millis(700);
+const MEASURE_EVERY: Duration = Duration::from_millis(1000);
 
 /// How often at least, however many points wait: what is put off is measured in the end, when the verdict waits for it.
-const MEASURE_AT_LEAST_EVERY: Duration = Duration::from_millis(2000);
+const MEASURE_AT_LEAST_EVERY: Duration = Duration::from_millis(2500);
 
 /// Share of the scan after which the edges are not looked at before it has ended.
 const LAST_LOOK: f64 = 0.96;

@@ -5,9 +5,9 @@ import { h } from "./dom.js";
 import { t } from "./text.js";
 
 /** Between two looks at the daemon, ms: quick enough to look alive, slow enough for a tablet. */
-const EVERY_MS = 200;
-/** And so many times as long as a look took: a tenth of a slow processor, which may be the one that computes the verdict. */
-const REST = 9;
+const EVERY_MS = 250;
+/** And so many times as long as drawing took, which takes the browser as long again: an eighth of a processor, which may be the one that computes the verdict. */
+const REST = 15;
 /** After the scan the verdict is computed, perhaps on the machine that shows the page: the last look waits for it, ms. */
 const LAST_MS = 600;
 /** A frame of numbers does not move when nothing new came: the picture is drawn only then. */
