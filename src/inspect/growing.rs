@@ -93,6 +93,28 @@ struct Piece {
 }
 
 impl Piece {
+    /// Finds the places of its points, of a part at `pose`.
+    fn place<B: Body>(&mut self, surface: &Surface<'_, B>, pose: RigidTransform) {
+        let turn = DMat3::from_quat(pose.rotation);
+        self.part = self.machine.map(
+            Frame::Part,
+            |p| turn * p + pose.translation,
+            |v| pose.vector(v),
+        );
+        let gate_mm = GATE * surface.size_mm();
+        let part = &self.part;
+        let laid: Vec<(Place, f32)> = (0..part.len())
+            .into_par_iter()
+            .with_min_len(512)
+            .map_init(Vec::new, |found, i| {
+                let p = part.positions[i];
+                let (place, rim) = surface.place_and_rim(p, towards(part, i), gate_mm, found);
+                (place, rim as f32)
+            })
+            .collect();
+        (self.places, self.rims) = laid.into_iter().unzip();
+    }
+
     fn layer(&self) -> Layer<'_> {
         Layer::new(&self.part, &self.places)
     }
@@ -385,23 +407,28 @@ impl<'a, B: Body> Growing<'a, B> {
         };
         let size_mm = self.surface.size_mm();
         if let Some(base) = &mut self.base
-            && base.is_of(known)
             && base.is_near(&pose, NEAR_ENOUGH, size_mm)
         {
-            base.searched = searched;
-            return false;
+            if base.is_of(known) {
+                base.searched = searched;
+                return false;
+            }
+            let pose = base.pose;
+            self.set_base(pose, known, searched);
+            return true;
         }
         self.set_base(pose, known, searched);
         true
     }
 
-    /// Lays all points at `pose`, for a scan of this spacing and noise.
+    /// Lays all points at `pose`, for a scan of this spacing and noise. Those that lie there already keep their places.
     fn set_base(&mut self, pose: RigidTransform, known: (Spacing, f64), searched: Searched) {
         let (spacing, noise_mm) = known;
         let settings = measure_settings(&spacing, noise_mm, &self.request, &mut Vec::new());
         let steps: Vec<Option<f64>> = self.resolved.iter().map(|r| r.station_step_mm).collect();
         let measuring = Measuring::new(&self.surface, &settings, &steps, false);
         let near_mm = compare::near_mm(&spacing);
+        let has_moved = self.base.as_ref().is_some_and(|base| base.pose != pose);
         self.base = Some(Base {
             pose,
             spacing,
@@ -413,36 +440,22 @@ impl<'a, B: Body> Growing<'a, B> {
             asked: self.points,
         });
         for piece in 0..self.pieces.len() {
+            if has_moved {
+                self.pieces[piece].places.clear();
+            }
             self.lay(piece);
         }
     }
 
-    /// Lays one piece on the nominal: pieces are laid in their order.
+    /// Lays one piece on the nominal, if it has no places yet, and measures by it: pieces are laid in their order.
     fn lay(&mut self, piece: usize) {
         let Some(base) = &mut self.base else {
             return;
         };
         let piece = &mut self.pieces[piece];
-        let pose = base.pose;
-        let turn = DMat3::from_quat(pose.rotation);
-        piece.part = piece.machine.map(
-            Frame::Part,
-            |p| turn * p + pose.translation,
-            |v| pose.vector(v),
-        );
-        let gate_mm = GATE * self.surface.size_mm();
-        let part = &piece.part;
-        let surface = &self.surface;
-        let laid: Vec<(Place, f32)> = (0..part.len())
-            .into_par_iter()
-            .with_min_len(512)
-            .map_init(Vec::new, |found, i| {
-                let p = part.positions[i];
-                let (place, rim) = surface.place_and_rim(p, towards(part, i), gate_mm, found);
-                (place, rim as f32)
-            })
-            .collect();
-        (piece.places, piece.rims) = laid.into_iter().unzip();
+        if piece.places.is_empty() {
+            piece.place(&self.surface, base.pose);
+        }
         piece.cells = base.outline.cells_of(&piece.part.positions);
         base.patches
             .add(&piece.part.positions, &piece.places, &base.outline);
