@@ -50,8 +50,10 @@ const ASKED_POINTS: usize = 30_000;
 /// Points that solve for the last pose at most: what that leaves open adds less than a hundredth to the variance of a station.
 const POSE_POINTS: usize = 200_000;
 
-/// Relative changes of spacing and noise, as estimated by a part of the scan and by all of it, that change no station.
-const SAME_SPACING: f64 = 0.03;
+/// Relative changes of spacing and noise, as estimated by a part of the scan and by all of it, for which nothing is measured anew: windows are
+/// as wide as so many points, and a point more or less among sixteen changes their uncertainty by 3 %. Slanting faces that come into view
+/// move the spacing by 4 % on the demo's part.
+const SAME_SPACING: f64 = 0.06;
 const SAME_NOISE: f64 = 0.15;
 
 /// Motion over the noise, at the half-diagonal, that values follow by first order: on a face of 5 mm radius 20 um leave 0.04 um.
