@@ -1,7 +1,7 @@
 //! The inspection that goes on while the devices scan, on a thread of its own.
 
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, TryRecvError, channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -25,6 +25,9 @@ const MEASURE_EVERY: Duration = Duration::from_millis(1000);
 
 /// How often at least, however many points wait: what is put off is measured in the end, when the verdict waits for it.
 const MEASURE_AT_LEAST_EVERY: Duration = Duration::from_millis(2500);
+
+/// When no points come for so long the scan is where there is none of the part: what is left to measure is measured at once.
+const QUIET: Duration = Duration::from_millis(200);
 
 /// Share of the scan after which the edges are not looked at before it has ended.
 const LAST_LOOK: f64 = 0.96;
@@ -85,21 +88,20 @@ fn follow(
     let mut looked: Option<Instant> = None;
     let mut fresh = false;
     loop {
-        let message = match receiver.try_recv() {
+        // While nothing waits there is time to look at the edges, if they are due or nothing comes for a while.
+        let due = looked.map_or(Duration::ZERO, |at| {
+            MEASURE_EVERY.saturating_sub(at.elapsed())
+        });
+        let wait = if fresh { due.min(QUIET) } else { MEASURE_EVERY };
+        let message = match receiver.recv_timeout(wait) {
             Ok(message) => message,
-            Err(TryRecvError::Disconnected) => return None,
-            Err(TryRecvError::Empty) => {
-                let due = looked.is_none_or(|at| at.elapsed() >= MEASURE_EVERY);
-                // Nothing waits: time to look at the edges.
-                if fresh && due {
+            Err(RecvTimeoutError::Timeout) => {
+                if fresh {
                     (looked, fresh) = (look(&mut growing), false);
                 }
-                match receiver.recv_timeout(MEASURE_EVERY) {
-                    Ok(message) => message,
-                    Err(RecvTimeoutError::Timeout) => continue,
-                    Err(RecvTimeoutError::Disconnected) => return None,
-                }
+                continue;
             }
+            Err(RecvTimeoutError::Disconnected) => return None,
         };
         match message {
             Message::Piece(piece, share) => {
