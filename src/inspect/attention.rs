@@ -43,8 +43,10 @@ type Cell = IVec3;
 
 /// The nominal edges, for telling what lies near one.
 pub(super) struct Outline {
-    /// Of every cell that something near an edge may lie in, the places along edges that may be near.
-    along: HashMap<Cell, Vec<DVec3>, FixedState>,
+    /// Places along the edges.
+    places: Vec<DVec3>,
+    /// Of every cell in which something near one may lie, which places may be near.
+    near: HashMap<Cell, Vec<u32>, FixedState>,
     grid: Grid,
     near_mm: f64,
 }
@@ -53,20 +55,21 @@ impl Outline {
     /// `near_mm` is the distance within which what is found belongs to a nominal edge.
     pub(super) fn new<B: Body>(nominal: &B, edges: &[BodyEdge], near_mm: f64) -> Self {
         let grid = Grid::new(PATCH / super::compare::NEAR * near_mm);
-        let mut along: HashMap<Cell, Vec<DVec3>, FixedState> = HashMap::default();
+        let mut places = Vec::new();
         for (e, edge) in edges.iter().enumerate() {
             let count = (edge.length_mm / (0.5 * near_mm)).ceil().clamp(1.0, 1e5) as usize;
             let at = |k: usize| edge.length_mm * k as f64 / count as f64;
-            for k in 0..=count {
-                let place = nominal.station(e, at(k)).point;
-                // A cell is wider than what is near.
-                for cell in around(grid.cell(place), 1) {
-                    along.entry(cell).or_default().push(place);
-                }
+            places.extend((0..=count).map(|k| nominal.station(e, at(k)).point));
+        }
+        let mut near: HashMap<Cell, Vec<u32>, FixedState> = HashMap::default();
+        for (i, place) in places.iter().enumerate() {
+            for cell in grid.cells_within(*place, near_mm) {
+                near.entry(cell).or_default().push(i as u32);
             }
         }
         Self {
-            along,
+            places,
+            near,
             grid,
             near_mm,
         }
@@ -93,8 +96,11 @@ impl Outline {
 
     /// Whether `p` lies near a nominal edge.
     pub(super) fn is_near(&self, p: DVec3) -> bool {
-        let places = self.along.get(&self.grid.cell(p));
-        let is_near = |place: &DVec3| place.distance_squared(p) <= self.near_mm * self.near_mm;
+        let is_near = |i: &u32| {
+            let place = self.places[*i as usize];
+            place.distance_squared(p) <= self.near_mm * self.near_mm
+        };
+        let places = self.near.get(&self.grid.cell(p));
         places.is_some_and(|places| places.iter().any(is_near))
     }
 }
@@ -201,14 +207,14 @@ impl<'a> Attention<'a> {
 }
 
 fn around(cell: Cell, reach: i32) -> impl Iterator<Item = Cell> {
-    let range = -reach..=reach;
-    range.clone().flat_map(move |x| {
-        let range = range.clone();
-        range.clone().flat_map(move |y| {
-            range
-                .clone()
-                .map(move |z| cell.wrapping_add(IVec3::new(x, y, z)))
-        })
+    let reach = IVec3::splat(reach);
+    cells(cell.saturating_sub(reach), cell.saturating_add(reach))
+}
+
+/// The cells from `low` to `high`, both included.
+fn cells(low: Cell, high: Cell) -> impl Iterator<Item = Cell> {
+    (low.x..=high.x).flat_map(move |x| {
+        (low.y..=high.y).flat_map(move |y| (low.z..=high.z).map(move |z| IVec3::new(x, y, z)))
     })
 }
 
@@ -228,6 +234,15 @@ impl Grid {
 
     fn cell(&self, p: DVec3) -> Cell {
         (self.turn * p / self.size_mm).floor().as_ivec3()
+    }
+
+    /// The cells of the box around what lies within `reach_mm` of `p`.
+    fn cells_within(&self, p: DVec3, reach_mm: f64) -> impl Iterator<Item = Cell> {
+        let at = |shift_mm: f64| {
+            let corner = (self.turn * p + shift_mm) / self.size_mm;
+            corner.floor().as_ivec3()
+        };
+        cells(at(-reach_mm), at(reach_mm))
     }
 
     fn centre(&self, cell: Cell) -> DVec3 {
@@ -300,3 +315,34 @@ impl Moments {
 }
 
 pub(super) type CellSet = HashSet<Cell, FixedState>;
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+    use crate::nominal::Nominal;
+
+    #[test]
+    fn what_is_near_an_edge_is_what_its_places_say() {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("configs/demo/part.step");
+        let nominal = Nominal::read(&path).expect("the demo's part");
+        let edges = Body::edges(&nominal);
+        let outline = Outline::new(&nominal, &edges, 0.5);
+        let mut counts = [0, 0];
+        for (i, place) in outline.places.iter().enumerate().step_by(7) {
+            // A direction of its own for each, and up to three times as far as what is near.
+            let way = DVec3::new(
+                (i as f64).sin(),
+                (2.3 * i as f64).cos(),
+                (0.7 * i as f64).sin(),
+            );
+            let p = *place + way * (i % 31) as f64 * 0.05;
+            let nearest = outline.places.iter().map(|q| q.distance(p));
+            let expected = nearest.fold(f64::INFINITY, f64::min) <= 0.5;
+            assert_eq!(outline.is_near(p), expected, "{p}");
+            counts[usize::from(expected)] += 1;
+        }
+        assert!(counts.iter().all(|count| *count > 50), "{counts:?}");
+    }
+}

@@ -430,7 +430,7 @@ impl<'a, B: Body> Growing<'a, B> {
         let steps: Vec<Option<f64>> = self.resolved.iter().map(|r| r.station_step_mm).collect();
         let measuring = Measuring::new(&self.surface, &settings, &steps, false);
         let near_mm = compare::near_mm(&spacing);
-        let has_moved = self.base.as_ref().is_some_and(|base| base.pose != pose);
+        let has_moved = self.base.as_ref().is_none_or(|base| base.pose != pose);
         self.base = Some(Base {
             pose,
             spacing,
