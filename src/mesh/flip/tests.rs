@@ -1,3 +1,5 @@
+//! Exchanges alone, in blocks, and where something is in the way.
+
 use proptest::prelude::*;
 
 use super::*;
