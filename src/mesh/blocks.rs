@@ -20,7 +20,8 @@ impl Blocks {
     pub fn new(points: &[DVec3], most: usize) -> Self {
         let mut order: Vec<u32> = (0..points.len() as u32).collect();
         let mut ends = Vec::new();
-        let mut waiting = vec![0..order.len()];
+        let all = 0..order.len();
+        let mut waiting = vec![all];
         while let Some(range) = waiting.pop() {
             let own = &mut order[range.clone()];
             match (own.len() > most).then(|| cut(points, own)).flatten() {
