@@ -62,7 +62,7 @@ const SMALL_MOTION: f64 = 2.0;
 /// Motion on the way up to which points stay where they were laid: half of what would be too far at the end, as it may go on.
 const NEAR_ENOUGH: f64 = 0.5 * SMALL_MOTION;
 
-/// The first pieces tell of spacing and noise, then one of so many: as many places as a scan that comes at once is asked at.
+/// The first pieces, in which more places are looked at than in all of a scan that comes at once, tell of spacing and noise; then one of so many.
 const ESTIMATED_ALL: usize = 24;
 const ESTIMATED_EVERY: usize = 4;
 

@@ -38,7 +38,7 @@ const MOST_LOSS: f64 = 0.7;
 /// Rounds of trying; later ones find next to nothing.
 const MOST_ROUNDS: usize = 8;
 
-/// Points of a block at most: what surrounds them fits in the cache of a core. The 80,000 triangles of a block of random points are some eight blocks.
+/// Points of a block at most: what surrounds them fits in the cache of a core.
 const BLOCK: usize = 1 << 14;
 
 /// The other side of an edge that has not two triangles.
